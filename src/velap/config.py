@@ -1,0 +1,293 @@
+"""Frozen configuration. Each default cites the table of the paper it comes from, or says `ours`.
+
+`paper` presets hold Tables 2-10 and nothing else; `default` presets hold whatever was measured to be best
+(`docs/decisions.md` says what was measured). `tasks.py` applies the per-task overrides.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from velap.errors import ConfigError
+
+Norm = Literal["batch", "layer", "none"]
+DynamicsLoss = Literal["infonce", "mse"]
+Anchor = Literal["none", "reject", "snap"]
+Precision = Literal["float32", "bfloat16"]
+
+
+def _require(condition: bool, field_name: str, got: object, expected: str) -> None:
+    if not condition:
+        raise ConfigError(f"config field `{field_name}` is {got!r}; expected {expected}. Change that field and start again.")
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Networks of App. B.1."""
+
+    frame_stack: int = 3
+    """Frames a state N [frames]. ours: the paper leaves N open for the simulated tasks and uses 3 on hardware (E.1)."""
+    latent_dim: int = 32
+    """d_Z, Table 7."""
+    norm: Norm = "layer"
+    """Normalisation of hidden layers. Tables 2-6: batch. ours: layer, no train/eval gap and no batch statistics in targets."""
+    encoder_filters: tuple[int, ...] = (32, 32, 64, 64)
+    """Table 2."""
+    encoder_kernels: tuple[int, ...] = (4, 4, 4, 4)
+    """Table 2 [px]."""
+    encoder_strides: tuple[int, ...] = (2, 2, 2, 2)
+    """Table 2 [px]."""
+    encoder_dense: tuple[int, ...] = (256, 128)
+    """Table 2, hidden dense layers; the last one has `latent_dim` units."""
+    dynamics_dense: tuple[int, ...] = (128, 128, 128, 128)
+    """Table 3, hidden layers."""
+    dynamics_residual: bool = True
+    """h predicts z + f(z, a) instead of f(z, a). ours: Table 3 is silent; off in `paper`."""
+    generative_dense: tuple[int, ...] = (128, 128, 128)
+    """Table 4, hidden layers of both halves of the action cVAE."""
+    noise_dim: int = 16
+    """m, latent dimension of the action cVAE, Table 4."""
+    policy_dense: tuple[int, ...] = (128, 128, 128)
+    """Table 5, hidden layers."""
+    critic_dense: tuple[int, ...] = (128, 128, 128)
+    """Table 6, hidden layers."""
+    critic_bounded: bool = True
+    """Critics end in a sigmoid: returns of a terminal 0/1 reward lie in [0, 1]. ours; off in `paper`."""
+    n_ens: int = 3
+    """Members of the local ensemble, Table 7."""
+    bank_size: int = 4096
+    """Dataset latents kept with the model for support tests and film strips; 0 keeps none. ours; 0 in `paper`."""
+
+    def __post_init__(self) -> None:
+        _require(1 <= self.frame_stack <= 16, "frame_stack", self.frame_stack, "1 to 16 frames")
+        _require(self.latent_dim >= 1, "latent_dim", self.latent_dim, "a positive number of units")
+        _require(self.norm in get_args(Norm), "norm", self.norm, f"one of {get_args(Norm)}")
+        sizes = {len(self.encoder_filters), len(self.encoder_kernels), len(self.encoder_strides)}
+        _require(len(sizes) == 1, "encoder_filters", self.encoder_filters, "as many filters as kernels and strides")
+        _require(self.noise_dim >= 1, "noise_dim", self.noise_dim, "a positive number of units")
+        _require(self.n_ens >= 1, "n_ens", self.n_ens, "at least one critic")
+        _require(self.bank_size >= 0, "bank_size", self.bank_size, "0 or a number of latents")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Joint training (Eq. 2-5, 9; Table 7; App. B.4, B.5) and the latent phase (ours)."""
+
+    joint_steps: int = 10_000
+    """Model updates of the joint phase [steps]. ours: the paper gives no number."""
+    batch_windows: int = 12
+    """Windows of consecutive frames a batch. Table 7: 64 transitions, so 64 windows with `whole_windows` off."""
+    window: int = 20
+    """Transitions a window [steps]. ours; `dynamics_horizon` in `paper`, where only the first transition trains the values."""
+    whole_windows: bool = True
+    """Every transition of a window trains the values, and goals come from the encoded frames. ours; off in `paper`."""
+    learning_rate: float = 3e-4
+    """Table 7, Adam."""
+    c0: float = 0.2
+    """Weight of the global critic's loss, Eq. 2, Table 7."""
+    c1: float = 0.01
+    """Weight of the dynamics loss, Eq. 2, Table 7 (0.001 in SpiralMaze)."""
+    c2: float = 0.001
+    """Weight of imitation in the local policy, Eq. 5, Table 7."""
+    c3: float = 0.001
+    """Weight of imitation in the global policy, Eq. 5, Table 7 (0.5 where experts are in the data)."""
+    discount: float = 0.96
+    """γ, Table 7."""
+    temperature: float = 1.0
+    """T of the InfoNCE similarity, App. B.5, Table 7."""
+    kl_weight: float = 0.01
+    """β of the action cVAE, Table 4."""
+    dynamics_horizon: int = 3
+    """k of Eq. 9 [steps], App. B.5."""
+    dynamics_loss: DynamicsLoss = "infonce"
+    """Loss of h in the joint phase: Eq. 9, or mean-squared error (App. E.3's comparison)."""
+    relabel_next: float = 0.2
+    """Share of goals that are the next state (strategy a of B.4). ours: the paper gives no shares."""
+    relabel_future: float = 0.4
+    """Share of goals from the future of the same trajectory (strategy b). ours."""
+    relabel_other: float = 0.4
+    """Share of goals from other trajectories (strategy c). ours."""
+    target_rate: float = 0.005
+    """Polyak rate of the target networks (TD3's value; the paper is silent)."""
+    policy_every: int = 1
+    """Model updates a policy update; 1 is the alternation of Eq. 2 and 5."""
+    latent_steps: int = 8_000
+    """Updates of the latent phase: encoder frozen, all latents cached. ours; 0 in `paper`."""
+    latent_batch: int = 256
+    """Windows a batch of the latent phase. ours."""
+    latent_horizon: int = 10
+    """Rollout length of the dynamics in the latent phase [steps]. ours."""
+    latent_learning_rate: float = 1e-3
+    """Peak learning rate of the latent phase, cosine to a hundredth. ours."""
+    precision: Precision = "bfloat16"
+    """Arithmetic of the encoder's convolutions. ours: 2.4 times the frames/s of float32 on a CPU with bf16 units."""
+    log_every: int = 50
+    """Model updates between logged losses [steps]. ours."""
+    diagnose_every: int = 1_000
+    """Model updates between rollout-error and calibration diagnostics [steps]. ours."""
+    checkpoint_every: int = 500
+    """Model updates between checkpoints [steps]. ours."""
+
+    def __post_init__(self) -> None:
+        for name in ("joint_steps", "latent_steps"):
+            _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more steps")
+        for name in ("batch_windows", "window", "dynamics_horizon", "policy_every", "latent_batch", "latent_horizon",
+                     "log_every", "diagnose_every", "checkpoint_every"):
+            _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        for name in ("learning_rate", "latent_learning_rate", "temperature"):
+            _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
+        for name in ("c0", "c1", "c2", "c3", "kl_weight"):
+            _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
+        _require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
+        _require(0 < self.target_rate <= 1, "target_rate", self.target_rate, "a rate in (0, 1]")
+        shares = self.relabel_next + self.relabel_future + self.relabel_other
+        _require(
+            min(self.relabel_next, self.relabel_future, self.relabel_other) >= 0 and abs(shares - 1) < 1e-6,
+            "relabel_next, relabel_future, relabel_other",
+            (self.relabel_next, self.relabel_future, self.relabel_other),
+            "three shares of 0 or more that add up to 1",
+        )
+        _require(self.dynamics_loss in get_args(DynamicsLoss), "dynamics_loss", self.dynamics_loss,
+                 f"one of {get_args(DynamicsLoss)}")
+        _require(self.window >= self.dynamics_horizon, "window", self.window,
+                 f"at least dynamics_horizon = {self.dynamics_horizon} steps")
+        _require(self.precision in get_args(Precision), "precision", self.precision, f"one of {get_args(Precision)}")
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Tree search (Algorithm 1, Eq. 6-8, Table 8, App. B.6). Thresholds on Q are given as exponents of γ, as in Table 8."""
+
+    n_iter: int = 250
+    """Expansions a plan, Table 8 (500 in ButtonWall). Counts candidates, not rounds."""
+    n_sim: int = 5
+    """Simulated steps an expansion [steps], Table 8 (10 in SpiralMaze, ButtonWall, DrawerButton)."""
+    candidates: int = 25
+    """K, candidates a round (batch processing, App. B.6). ours: the paper gives no number."""
+    discard_high_exponent: float = 2.0
+    """τ_high = γ^this, Table 8: too close to a node of the tree."""
+    discard_low_exponent: float | None = None
+    """τ_low = γ^this; None reads it as n_sim, Table 8. ours may widen it: straight rollouts are exactly n_sim long."""
+    discard_std: float | None = None
+    """τ_std [Q-value]; None reads it as 1 - γ, Table 8."""
+    neighbour_exponent: float = 3.0
+    """τ_neigh = γ^this, Table 8."""
+    goal_exponent: float = 5.0
+    """τ_goal = γ^this, Table 8."""
+    neighbour_distance_factor: float = 3.0
+    """d_neigh is this times the upper 5-percentile of one-step latent distances, Table 8."""
+    p_sparse: float = 0.4
+    """p^sparse of the node sampling mixture. ours: the paper gives no number."""
+    p_value: float = 0.4
+    """p^value of the node sampling mixture; the rest is uniform. ours."""
+    temperature_sparse: float = 1.0
+    """T_sparse of Eq. 6 [neighbours]. ours."""
+    temperature_value: float = 0.1
+    """T_value of Eq. 7 [Q-value]. ours."""
+    p_policy: float = 0.2
+    """p^policy: an expansion acts by π^g instead of g. ours: the paper gives no number."""
+    coherent_noise: bool = True
+    """Draw the action noise once a simulation instead of once a step (the data are correlated walks). ours; off in `paper`."""
+    anchor: Anchor = "none"
+    """What to do with candidates by their nearest dataset latent: nothing, reject beyond `anchor_factor`, or also snap. ours."""
+    anchor_factor: float = 1.0
+    """Largest distance to a dataset latent, in upper 5-percentiles of one-step distances. ours."""
+
+    def __post_init__(self) -> None:
+        for name in ("n_iter", "n_sim", "candidates"):
+            _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        for name in ("temperature_sparse", "temperature_value", "neighbour_distance_factor", "anchor_factor"):
+            _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
+        for name in ("p_sparse", "p_value", "p_policy"):
+            _require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
+        _require(self.p_sparse + self.p_value <= 1 + 1e-9, "p_sparse + p_value", self.p_sparse + self.p_value, "at most 1")
+        _require(self.anchor in get_args(Anchor), "anchor", self.anchor, f"one of {get_args(Anchor)}")
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """MPC loop (Algorithm 2, Table 9)."""
+
+    n_replan: int = 15
+    """Environment steps between plans, Table 9 (25 in SpiralMaze, ButtonWall)."""
+    stop_exponent: float = 5.0
+    """τ_stop = γ^this: π^g takes over, Table 9."""
+    waypoint_exponent: float = 3.0
+    """τ_wp = γ^this: on to the next waypoint, Table 9."""
+
+    def __post_init__(self) -> None:
+        _require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides a result, saved with every run."""
+
+    task: str
+    preset: str
+    model: ModelConfig = field(default_factory=ModelConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    controller: ControllerConfig = field(default_factory=ControllerConfig)
+
+    def to_json(self) -> str:
+        """Canonical JSON: sorted keys, so that equal configs are equal text."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+    def hash(self) -> str:
+        """First 12 hexadecimal digits of the SHA-256 of `to_json()`."""
+        return hashlib.sha256(self.to_json().encode()).hexdigest()[:12]
+
+    @staticmethod
+    def from_json(text: str) -> Config:
+        """Inverse of `to_json`; raises ConfigError on unknown or missing fields."""
+        try:
+            raw = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ConfigError(f"the config is not JSON ({error}); expected the text that velap saved. Restore the file.") from error
+        return _build(Config, raw, "config")
+
+
+def _build(cls: type, raw: Any, where: str) -> Any:
+    """A dataclass from parsed JSON, lists back to tuples, unknown keys refused."""
+    if not isinstance(raw, dict):
+        raise ConfigError(f"`{where}` is {type(raw).__name__}; expected an object with the fields of {cls.__name__}.")
+    hints = get_type_hints(cls)
+    unknown = sorted(set(raw) - set(hints))
+    if unknown:
+        raise ConfigError(f"`{where}` has unknown fields {unknown}; expected some of {sorted(hints)}. "
+                          "The file may come from another version of velap.")
+    values = {}
+    for name, value in raw.items():
+        hint = hints[name]
+        if dataclasses.is_dataclass(hint):
+            value = _build(hint, value, f"{where}.{name}")  # type: ignore[arg-type]
+        elif get_origin(hint) is tuple and isinstance(value, list):
+            value = tuple(value)
+        values[name] = value
+    try:
+        return cls(**values)
+    except TypeError as error:
+        raise ConfigError(f"`{where}` does not fit {cls.__name__}: {error}.") from error
+
+
+def override(config: Config, **changes: dict[str, Any]) -> Config:
+    """A copy with fields of its parts replaced: `override(config, train={"joint_steps": 10})`."""
+    parts = {}
+    for part, fields in changes.items():
+        current = getattr(config, part)
+        unknown = sorted(set(fields) - {f.name for f in dataclasses.fields(current)})
+        if unknown:
+            names = sorted(f.name for f in dataclasses.fields(current))
+            raise ConfigError(f"`{part}` has no field {unknown}; expected some of {names}.")
+        parts[part] = dataclasses.replace(current, **fields)
+    return dataclasses.replace(config, **parts)
+
+
+PAPER_MODEL: dict[str, Any] = {"norm": "batch", "dynamics_residual": False, "critic_bounded": False, "bank_size": 0}
+PAPER_TRAIN: dict[str, Any] = {"batch_windows": 64, "window": 3, "whole_windows": False, "latent_steps": 0, "joint_steps": 100_000}
+PAPER_PLANNER: dict[str, Any] = {"coherent_noise": False, "anchor": "none", "discard_low_exponent": None}

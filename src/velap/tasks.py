@@ -1,0 +1,89 @@
+"""The only registry: task → environment, dataset recipe (Table 10), per-task overrides (Tables 7-9), horizon limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from velap.config import PAPER_MODEL, PAPER_PLANNER, PAPER_TRAIN, Config, override
+from velap.errors import UnknownTaskError
+
+PRESETS = ("default", "paper")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a dataset is made (Table 10)."""
+
+    contexts: int
+    """Environment initialisations apart from the agent."""
+    trajectories: int
+    """Trajectories a context."""
+    max_steps: int
+    """Longest trajectory [steps]."""
+    success_percent: float
+    """Share of transitions with reward 1, as the paper reports it [%]."""
+    action_noise: float = 0.3
+    """Standard deviation of the Gaussian steps of the random-walk actions (C.1.1). ours: the paper gives no number."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task of App. C."""
+
+    name: str
+    env_id: str
+    """Gymnasium id."""
+    entry_point: str
+    """`module:Class`, imported only when the environment is made."""
+    max_steps: int
+    """Time limit of an episode [steps], App. C."""
+    recipe: Recipe
+    overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Tables 7-9: fields that differ on this task, in both presets."""
+    default_overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """ours: fields that differ on this task in the default preset."""
+
+    @property
+    def dataset_id(self) -> str:
+        """Minari id of the dataset that `velap collect` writes with seed 0."""
+        return f"velap/{self.name}-v0"
+
+
+TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (
+        Task(
+            name="SpiralMaze",
+            env_id="velap/SpiralMaze-v0",
+            entry_point="velap.envs.block_maze:SpiralMaze",
+            max_steps=300,
+            recipe=Recipe(contexts=1, trajectories=1000, max_steps=20, success_percent=0.12),
+            overrides={"train": {"c1": 0.001}, "planner": {"n_sim": 10}, "controller": {"n_replan": 25}},
+        ),
+    )
+}
+
+
+def get_task(name: str) -> Task:
+    """The task of that name; raises UnknownTaskError with the names that exist."""
+    if name not in TASKS:
+        raise UnknownTaskError(f"unknown task {name!r}; expected one of {', '.join(TASKS)}. Names are case-sensitive.")
+    return TASKS[name]
+
+
+def make_config(task: str, preset: str = "default") -> Config:
+    """The config of one task and preset: `paper` is Tables 2-10 and nothing else, `default` what we measured to be best.
+
+    `task` may be the id of a foreign dataset or environment: it then gets no overrides.
+    """
+    if preset not in PRESETS:
+        raise UnknownTaskError(f"unknown preset {preset!r}; expected one of {', '.join(PRESETS)}.")
+    config = Config(task=task, preset=preset)
+    if preset == "paper":
+        config = override(config, model=PAPER_MODEL, train=PAPER_TRAIN, planner=PAPER_PLANNER)
+    if task in TASKS:
+        config = override(config, **TASKS[task].overrides)
+        if preset == "default":
+            config = override(config, **TASKS[task].default_overrides)
+    return config
