@@ -180,6 +180,9 @@ class PlannerConfig:
     """τ_goal = γ^this, Table 8."""
     neighbour_distance_factor: float = 3.0
     """d_neigh is this times the upper 5-percentile of one-step latent distances, Table 8."""
+    max_neighbours: int = 16
+    """M, nearest tree nodes that a candidate is compared with inside d_neigh. ours: the paper compares with all of them, which
+    is the same as long as no more than M lie within d_neigh."""
     p_sparse: float = 0.4
     """p^sparse of the node sampling mixture. ours: the paper gives no number."""
     p_value: float = 0.4
@@ -198,7 +201,7 @@ class PlannerConfig:
     """Largest distance to a dataset latent, in upper 5-percentiles of one-step distances. ours."""
 
     def __post_init__(self) -> None:
-        for name in ("n_iter", "n_sim", "candidates"):
+        for name in ("n_iter", "n_sim", "candidates", "max_neighbours"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("temperature_sparse", "temperature_value", "neighbour_distance_factor", "anchor_factor"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")

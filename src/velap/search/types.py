@@ -1,0 +1,107 @@
+"""What search takes and gives back. Batch letters of the whole package:
+
+B environments planned for at once, N nodes a tree holds (n_iter + 1), K candidates of one round, L nodes of the longest
+possible path, D latent dimension, A action dimension, m noise dimension.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+RowGenerator = torch.Generator | Sequence[torch.Generator]
+"""One generator for all rows, or one a row: then a row's numbers do not depend on the other rows."""
+
+
+class SearchFns(NamedTuple):
+    """The model as search sees it (Eq. 1): callables over any batch prefix, without gradients, safe to call with 0 rows."""
+
+    propose: Callable[[Tensor, Tensor], Tensor]
+    """g: latents [*, D], standard normal noise [*, m] → actions [*, A] in [-1, 1]."""
+    act_global: Callable[[Tensor], Tensor]
+    """π^g: latents [*, D] → actions [*, A] in [-1, 1]."""
+    step: Callable[[Tensor, Tensor], Tensor]
+    """h: latents [*, D], actions [*, A] → latents [*, D] one step later."""
+    reach: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    """Q^l: from [*, D], to [*, D] → ensemble minimum [*] and standard deviation [*] [Q-value] of going there by π^l."""
+    value: Callable[[Tensor], Tensor]
+    """Q^g(z, π^g(z)): latents [*, D] → [*] [Q-value]."""
+    q: Callable[[Tensor, Tensor], Tensor]
+    """Q^g: latents [*, D], actions [*, A] → [*] [Q-value]."""
+    noise_dim: int
+    """m."""
+    discount: float
+    """γ, Table 7."""
+    d_neigh: float
+    """Radius of the candidate neighbours, Table 8 [latent distance]."""
+    step_distance: float
+    """Upper 5-percentile of the distances between subsequent encodings [latent distance]."""
+    project: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None
+    """Latents [*, D] → nearest dataset latent [*, D] and its distance [*]; None where the model keeps no bank."""
+
+
+class Outcome(IntEnum):
+    """What became of a candidate; of several reasons the first in this order is kept."""
+
+    ACCEPTED = 0
+    UNSUPPORTED = 1
+    """Farther than `anchor_factor` one-step distances from every dataset latent (ours)."""
+    LOW = 2
+    """Q_min^{exp,new} is not above τ_low: too far from the node it was expanded from (Alg. 1, line 13)."""
+    STD = 3
+    """Q_std^{exp,new} is not below τ_std: the ensemble disagrees (Alg. 1, line 13)."""
+    HIGH = 4
+    """Some Q_min^{i,new} is not below τ_high: a node of the tree, or an earlier one of the round, is too close (line 14)."""
+
+
+class Rejections(NamedTuple):
+    """Candidates a plan rejected, by reason, int64 [B] each; with `tree.size - 1` accepted ones they add up to n_iter."""
+
+    unsupported: Tensor
+    low: Tensor
+    std: Tensor
+    high: Tensor
+
+
+@dataclass(frozen=True)
+class Tree:
+    """B trees of fixed capacity. Slot 0 is the root; slots are filled in order, a parent always before its children.
+
+    Slots from `size` on are unused: latent 0, parent -1, goal value -inf, root steps inf, count 0.
+    """
+
+    latents: Tensor
+    """[B, N, D]."""
+    parents: Tensor
+    """[B, N] int64 slot of the parent; -1 for the root."""
+    goal_values: Tensor
+    """[B, N] Q^g [Q-value]."""
+    root_steps: Tensor
+    """[B, N] sum of log_γ Q_min over the edges from the root (Eq. 8) [steps]."""
+    neighbour_counts: Tensor
+    """[B, N] int64 n^neigh, nodes within d_neigh that reach this one with Q_min > τ_neigh (Sec. 4, "Node sampling")."""
+    size: Tensor
+    """[B] int64 nodes in use, at least 1."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The chosen path g* (Eq. 8) of every row, and the tree it was found in."""
+
+    waypoints: Tensor
+    """[B, L, D] latents, root first, the last one repeated."""
+    length: Tensor
+    """[B] int64 nodes of the path, the root included: 1 means that there is nowhere to go."""
+    cost: Tensor
+    """[B] c(g*) [steps]."""
+    reached_goal: Tensor
+    """[B] bool: some node has Q^g > τ_goal; otherwise the path leads to the node of highest Q^g."""
+    nodes: Tensor
+    """[B, L] int64 slots of the waypoints in the tree."""
+    tree: Tree
+    rejections: Rejections
