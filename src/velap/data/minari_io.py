@@ -1,0 +1,201 @@
+"""Where Minari datasets lie, how one is put in place whole or not at all, and how a damaged one is noticed.
+
+Minari 0.5.4: a dataset is a directory `<root>/<id>/data` with `metadata.json` and `main_data.hdf5`; directories whose name begins
+with a dot are not listed, so unfinished work lives in `<root>/<namespace>/.<name>.partial`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from minari.dataset.minari_dataset import DATASET_ID_RE, MinariDataset
+from minari.namespace import create_namespace, list_local_namespaces
+from minari.storage.datasets_root_dir import get_dataset_path
+from minari.storage.local import list_local_datasets
+
+from velap.errors import DatasetError, StorageError
+
+UNREADABLE = (
+    OSError, KeyError, ValueError, RuntimeError, TypeError, AssertionError, IndexError, AttributeError, EOFError, OverflowError,
+    MemoryError, struct.error, gym.error.Error,
+)
+"""What Minari, h5py and Pillow raise on files that are damaged or were never theirs."""
+
+DATA_FILE = "main_data.hdf5"
+METADATA_FILE = "metadata.json"
+VELAP_KEY = "velap"
+"""Key of `metadata.json` under which velap keeps checksums and provenance."""
+
+
+def check_dataset_id(dataset_id: str) -> None:
+    """Raise DatasetError unless Minari takes `dataset_id` as `(namespace/)name-v0`."""
+    match = DATASET_ID_RE.fullmatch(dataset_id)
+    namespace = match.group("namespace") if match else None
+    if match is None or match.group("version") is None or (namespace or "").startswith("/"):
+        raise DatasetError(f"{dataset_id!r} is not a Minari dataset id; expected (namespace/)name-v0, letters, digits, - and _ "
+                           "only, a version at the end, for example velap/SpiralMaze-v0.")
+
+
+def dataset_path(dataset_id: str) -> Path:
+    """Directory of a dataset, existing or not, under MINARI_DATASETS_PATH or Minari's default root."""
+    check_dataset_id(dataset_id)
+    try:
+        return get_dataset_path(dataset_id)
+    except OSError as error:
+        raise storage_error(error, "Minari's root directory") from error
+
+
+def partial_path(dataset_id: str) -> Path:
+    """Directory beside the dataset where unfinished work on it lies."""
+    target = dataset_path(dataset_id)
+    return target.parent / f".{target.name}.partial"
+
+
+def storage_error(error: OSError, what: str) -> StorageError:
+    """A StorageError that says what could not be written, why, and what to do."""
+    reason = str(error)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) or "errno = 28" in reason or "No space left" in reason:
+        way_out = "The disk is full: free some space, or point MINARI_DATASETS_PATH to another disk, and run the same command again."
+    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        way_out = "There is no permission to write: point MINARI_DATASETS_PATH to a directory of yours."
+    else:
+        way_out = "Make the place writable, or point MINARI_DATASETS_PATH to another one, and run the same command again."
+    return StorageError(f"could not write {what}: {reason}. Nothing half-written was put in place. {way_out}")
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def fsync_tree(directory: Path) -> None:
+    """Force every file of `directory`, and the directories themselves, to the disk."""
+    for path in [*directory.rglob("*"), directory]:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def write_atomic(path: Path, content: bytes) -> None:
+    """Write a small file so that a reader sees the old or the new content, never a part."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def make_namespace(dataset_id: str) -> None:
+    """Create the Minari namespace of `dataset_id` where it is missing."""
+    namespace = DATASET_ID_RE.fullmatch(dataset_id).group("namespace")  # type: ignore[union-attr]
+    if namespace is not None and namespace not in list_local_namespaces():
+        with contextlib.suppress(ValueError):  # another process was first
+            create_namespace(namespace)
+
+
+def install(built: Path, target: Path) -> None:
+    """Rename the finished dataset `built` to `target`; a dataset that was there is deleted after the new one is in place."""
+    old = target.parent / f".{target.name}.old"
+    shutil.rmtree(old, ignore_errors=True)
+    if target.exists():
+        target.rename(old)
+    built.rename(target)
+    fsync_directory(target.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def fsync_directory(directory: Path) -> None:
+    """Force the names in `directory` to the disk."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def exclusive(directory: Path, dataset_id: str) -> Iterator[None]:
+    """Hold the lock of a work directory; the kernel releases it however the process ends."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with (directory / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StorageError(f"another process is writing {dataset_id} (it holds {directory / 'lock'}); expected to be alone. "
+                               "Wait for it or stop it, then run the same command again.") from error
+        yield
+
+
+def read_metadata(dataset_id: str) -> dict[str, Any]:
+    """`metadata.json` of a local dataset; DatasetError when there is none or it is damaged."""
+    path = dataset_path(dataset_id) / "data" / METADATA_FILE
+    if not path.parent.is_dir():
+        raise DatasetError(_missing(dataset_id))
+    try:
+        metadata = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise damaged(dataset_id, f"{path} cannot be read ({error})") from error
+    if not isinstance(metadata, dict):
+        raise damaged(dataset_id, f"{path} does not hold an object")
+    return metadata
+
+
+def open_dataset(dataset_id: str) -> MinariDataset:
+    """The Minari dataset of that id, its data file checked against the checksum that velap left, if it did."""
+    metadata = read_metadata(dataset_id)
+    path = dataset_path(dataset_id) / "data"
+    expected = velap_metadata(metadata).get("file_sha256")
+    if expected is not None:
+        try:
+            got = file_sha256(path / DATA_FILE)
+        except OSError as error:
+            raise damaged(dataset_id, f"{path / DATA_FILE} cannot be read ({error})") from error
+        if got != expected:
+            raise damaged(dataset_id, f"{path / DATA_FILE} has SHA-256 {got[:12]}…, expected {str(expected)[:12]}…")
+    try:
+        return MinariDataset(path)
+    except UNREADABLE as error:
+        raise damaged(dataset_id, f"Minari cannot open it ({type(error).__name__}: {error})") from error
+
+
+def velap_metadata(metadata: dict[str, Any]) -> dict[str, Any]:
+    """The part of `metadata.json` that velap wrote, empty for datasets of others."""
+    entry = metadata.get(VELAP_KEY)
+    return entry if isinstance(entry, dict) else {}
+
+
+def damaged(dataset_id: str, detail: str) -> DatasetError:
+    """DatasetError for files that are truncated, bit-flipped or changed after they were written."""
+    return DatasetError(f"the dataset {dataset_id} is damaged or was changed after it was written: {' '.join(detail.split())}. Expected "
+                        "the files as they were written. Restore them from a copy, or write the dataset again (for a task of "
+                        "velap: velap collect TASK --overwrite).")
+
+
+def _missing(dataset_id: str) -> str:
+    try:
+        known = sorted(list_local_datasets())
+    except UNREADABLE:
+        known = []
+    near = difflib.get_close_matches(dataset_id, known, n=3, cutoff=0.5) or known[:5]
+    here = f"here are {', '.join(near)}" if near else "there is none here yet"
+    return (f"there is no Minari dataset {dataset_id!r} under {get_dataset_path()}; {here}. Make it with velap collect TASK, fetch it with "
+            "minari download, or set MINARI_DATASETS_PATH to where it lies.")
