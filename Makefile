@@ -1,0 +1,19 @@
+# `make demo` and `make test` do all the set-up by themselves; nothing else needs to be run first.
+.PHONY: demo test check setup clean
+
+demo: setup
+	.venv/bin/velap demo
+
+test: check
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest
+
+check: setup
+	.venv/bin/ruff check .
+	.venv/bin/mypy
+	.venv/bin/lint-imports
+
+setup:
+	@bash scripts/setup.sh
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache build src/velap.egg-info

@@ -1,0 +1,64 @@
+"""Agents that look at the current state only: uniform random actions, and π^g alone (TD3-BC of Table 1)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from velap.agents.base import masked_seeds
+
+if TYPE_CHECKING:
+    from gymnasium.spaces import Box
+
+    from velap.models.latent import LatentModel
+
+
+class RandomAgent:
+    """Uniform actions over the action space, from one generator a row."""
+
+    method = "random"
+
+    def __init__(self, action_space: Box, frame_stack: int = 1) -> None:
+        self.frame_stack = frame_stack
+        self.last_plan_ms: NDArray[np.float64] = np.empty(0)
+        self._low = action_space.low.astype(np.float32)
+        self._high = action_space.high.astype(np.float32)
+        self._generators: list[np.random.Generator] = []
+
+    def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
+        """New generators where `mask` [B] is set."""
+        if len(self._generators) != len(mask):
+            self._generators = [np.random.default_rng(row) for row in range(len(mask))]
+            self.last_plan_ms = np.full(len(mask), np.nan)
+        for row, seed in masked_seeds(mask, seeds):
+            self._generators[row] = np.random.default_rng(seed)
+
+    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Actions [B, A]; the frames are not looked at."""
+        draws = [generator.uniform(self._low, self._high) for generator in self._generators]
+        return np.stack(draws).astype(np.float32)
+
+
+class ReactiveAgent:
+    """π^g at every step: the model-free policy that VELAP plans over, called TD3-BC in Table 1."""
+
+    method = "td3bc"
+
+    def __init__(self, model: LatentModel, frame_stack: int) -> None:
+        self.frame_stack = frame_stack
+        self.last_plan_ms: NDArray[np.float64] = np.empty(0)
+        self._model = model
+        self._device = next(model.parameters()).device
+
+    def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
+        """Nothing to forget: π^g is a function of the state."""
+        self.last_plan_ms = np.full(len(mask), np.nan)
+
+    @torch.inference_mode()
+    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Frames [B, N, H, W, 3] -> actions [B, A]."""
+        latents = self._model.encode(torch.from_numpy(frames).to(self._device))
+        return self._model.to_env(self._model.act_global(latents))

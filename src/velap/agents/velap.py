@@ -1,0 +1,132 @@
+"""The VELAP controller: Algorithm 2 with the settings of Table 9 (App. B.7), vectorised over environments.
+
+B environments, N stacked frames, D latent dimensions, L waypoints of the longest plan held, P rows that plan in one call.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from velap.agents.base import masked_seeds
+from velap.models.horizon import q_from_steps
+from velap.search.est import plan
+from velap.search.types import Plan, SearchFns
+
+if TYPE_CHECKING:
+    from velap.config import Config
+    from velap.models.latent import LatentModel
+
+
+class VelapAgent:
+    """Plans every `n_replan` steps of a row, follows the waypoints by π^l, and hands over to π^g near the goal.
+
+    Rows replan at their own times; those due at one step plan as one batch. A row's randomness is its own generator's, so
+    that the other rows reach it through the rounding of batched arithmetic only.
+    """
+
+    method = "velap"
+
+    def __init__(self, model: LatentModel, config: Config) -> None:
+        self.frame_stack = config.model.frame_stack
+        self.last_plan_ms: NDArray[np.float64] = np.empty(0)
+        self.last_plan: Plan | None = None
+        """Plan of the rows `planned_rows`, kept for figures and videos."""
+        self.planned_rows: NDArray[np.int64] = np.empty(0, np.int64)
+        """[P] rows that planned in the last `act`."""
+        self._model = model
+        self._fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
+        self._planner = config.planner
+        self._n_replan = config.controller.n_replan
+        self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
+        self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
+        self._device = next(model.parameters()).device
+        self._generators: list[torch.Generator] = []
+        self._plan_age = torch.empty(0, dtype=torch.long)
+        self._waypoints = torch.empty(0, 1, 0)
+        self._length = torch.empty(0, dtype=torch.long)
+        self._current = torch.empty(0, dtype=torch.long)
+
+    def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
+        """Forget the plans where `mask` [B] is set and seed those rows anew."""
+        if len(self._generators) != len(mask):
+            self._allocate(len(mask))
+        for row, seed in masked_seeds(mask, seeds):
+            self._generators[row].manual_seed(seed)
+        started = torch.from_numpy(mask).to(self._device)
+        self._plan_age[started] = self._n_replan
+        self._length[started] = 0
+
+    def _allocate(self, batch: int) -> None:
+        """Empty state for `batch` rows."""
+        self._generators = [torch.Generator().manual_seed(row) for row in range(batch)]
+        self._plan_age = torch.full((batch,), self._n_replan, device=self._device)
+        self._waypoints = torch.zeros(batch, 1, 0, device=self._device)
+        self._length = torch.zeros(batch, dtype=torch.long, device=self._device)
+        self._current = torch.zeros(batch, dtype=torch.long, device=self._device)
+        self.last_plan_ms = np.full(batch, np.nan)
+
+    @torch.inference_mode()
+    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """One step of Algorithm 2: frames [B, N, H, W, 3] -> actions [B, A]."""
+        latents = self._model.encode(torch.from_numpy(frames).to(self._device))
+        near_goal = self._fns.value(latents) > self._stop_value
+        self._replan(latents, (self._plan_age >= self._n_replan) & ~near_goal)
+        self._advance(latents)
+        self._plan_age += 1
+
+        # A plan of the root alone leads nowhere, and a row near the goal may have none: π^g acts in both.
+        by_waypoint = ~near_goal & (self._length > 1)
+        actions = self._model.act_global(latents)
+        if by_waypoint.any():
+            rows = torch.arange(len(latents), device=self._device)
+            local = self._model.act_local(latents, self._waypoints[rows, self._current])
+            actions = torch.where(by_waypoint[:, None], local, actions)
+        return self._model.to_env(actions)
+
+    def _replan(self, latents: Tensor, due: Tensor) -> None:
+        """Plan for the rows `due` [B] from `latents` [B, D] and store their waypoints."""
+        self.last_plan_ms[:] = np.nan
+        self.planned_rows = np.flatnonzero(due.cpu().numpy())
+        if len(self.planned_rows) == 0:
+            return
+        rows = torch.from_numpy(self.planned_rows).to(self._device)
+        start = time.perf_counter()
+        result = plan(self._fns, latents[rows], self._planner, [self._generators[row] for row in self.planned_rows])
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        self.last_plan_ms[self.planned_rows] = (time.perf_counter() - start) * 1e3 / len(self.planned_rows)
+        self.last_plan = result
+        self._store(rows, result.waypoints, result.length)
+
+    def _store(self, rows: Tensor, waypoints: Tensor, length: Tensor) -> None:
+        """Put waypoints [P, L', D] of `rows` [P] into the held [B, L, D], widening L where needed."""
+        width = max(waypoints.shape[1], self._waypoints.shape[1])
+        if self._waypoints.shape[1:] != (width, waypoints.shape[2]):
+            held = self._waypoints.new_zeros(len(self._length), width, waypoints.shape[2])
+            held[:, : self._waypoints.shape[1], : self._waypoints.shape[2]] = self._waypoints
+            self._waypoints = held
+        self._waypoints[rows, : waypoints.shape[1]] = waypoints.to(self._waypoints.dtype)
+        self._length[rows] = length
+        self._current[rows] = (length - 1).clamp(max=1)
+        self._plan_age[rows] = 0
+
+    def _advance(self, latents: Tensor) -> None:
+        """`update_waypoint` of Algorithm 2: on to the next one while Q_min(z_curr, z_wp) > τ_wp; the last one stays."""
+        rows = torch.nonzero(self._current < self._length - 1).flatten()
+        while len(rows):
+            q_min, _ = self._fns.reach(latents[rows], self._waypoints[rows, self._current[rows]])
+            rows = rows[q_min > self._reached_value]
+            self._current[rows] += 1
+            rows = rows[self._current[rows] < self._length[rows] - 1]
+
+    def waypoints_ahead(self, row: int) -> Tensor:
+        """[L', D] waypoints of `row` that are still ahead, the current one first; empty before the first plan."""
+        if self._length[row] == 0:
+            return self._waypoints.new_zeros(0, self._waypoints.shape[2])
+        return self._waypoints[row, self._current[row] : self._length[row]].clone()

@@ -1,0 +1,206 @@
+"""Episode records: one JSON line an episode, appended as it finishes, so that a killed evaluation loses at most one episode.
+
+A file holds one run only: same config, checkpoint and environment. A torn last line (the process was killed while writing)
+is dropped when the file is opened again; damage anywhere else is an error.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import fcntl
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+from typing import Self
+
+from velap.errors import RecordError
+from velap.runs import storage_errors
+
+IDENTITY = ("task", "method", "preset", "train_seed", "env", "config_hash", "checkpoint")
+"""Fields that every record of one file shares."""
+
+
+@dataclass(frozen=True)
+class RunKey:
+    """What decides the result of an episode besides its seed."""
+
+    task: str
+    """Task name; the environment id where `--env` named one."""
+    method: str
+    preset: str
+    train_seed: int
+    env: str
+    """Gymnasium id."""
+    config_hash: str
+    checkpoint: str
+    """SHA-256 of the checkpoint file [hex]; empty for methods without one."""
+    code_version: str
+    """Package version and commit; may differ between the records of one file."""
+
+    def path(self, root: Path) -> Path:
+        """`<root>/<task>/<method>-<preset>/train<seed>.jsonl`."""
+        folder = self.task.replace("/", "_").replace(":", "_")
+        return root / folder / f"{self.method}-{self.preset}" / f"train{self.train_seed}.jsonl"
+
+
+@dataclass(frozen=True)
+class Record:
+    """One episode."""
+
+    task: str
+    method: str
+    preset: str
+    train_seed: int
+    env: str
+    config_hash: str
+    checkpoint: str
+    code_version: str
+    episode_seed: int
+    success: bool
+    steps: int
+    """Environment steps taken [steps]."""
+    truncated: bool
+    """Ended by the time limit."""
+    plan_ms: tuple[float, ...]
+    """Every plan's time [ms]: its row's share of the batch that planned together."""
+
+    @staticmethod
+    def from_json(line: str) -> Record:
+        """Parse one line; raises ValueError on anything that is not exactly a record."""
+        raw = json.loads(line)
+        if not isinstance(raw, dict):
+            raise ValueError(f"a {type(raw).__name__} instead of an object")
+        expected = {field.name for field in dataclasses.fields(Record)}
+        if set(raw) != expected:
+            raise ValueError(f"missing keys {sorted(expected - set(raw))}, unknown keys {sorted(set(raw) - expected)}")
+        raw["plan_ms"] = tuple(raw["plan_ms"])
+        return Record(**raw)
+
+    def to_json(self) -> str:
+        """One line without its end, keys in the order of the fields."""
+        return json.dumps(dataclasses.asdict(self))
+
+
+def read_records(path: Path) -> list[Record]:
+    """All whole records of a file; a torn last line is left out. Raises RecordError on damage elsewhere or doubled seeds."""
+    return _parse(path, path.read_bytes())[0]
+
+
+def _parse(path: Path, payload: bytes) -> tuple[list[Record], int]:
+    """The records of `payload` and the length of its sound beginning [bytes]."""
+    records: list[Record] = []
+    sound = 0
+    for number, line in enumerate(payload.splitlines(keepends=True), start=1):
+        if not line.endswith(b"\n"):
+            break
+        try:
+            records.append(Record.from_json(line.decode()))
+        except (ValueError, TypeError) as error:
+            raise RecordError(f"{path}, line {number} is not a record ({error}). Restore the file, or move it aside with "
+                              "--fresh and evaluate again.") from error
+        sound += len(line)
+    seeds = [record.episode_seed for record in records]
+    if len(set(seeds)) != len(seeds):
+        doubled = sorted({seed for seed in seeds if seeds.count(seed) > 1})
+        raise RecordError(f"{path} counts the episode seeds {doubled[:5]} more than once; every seed counts exactly once. "
+                          "Move it aside with --fresh and evaluate again.")
+    return records, sound
+
+
+class RecordFile:
+    """The record file of one run, open for appending and locked against a second writer."""
+
+    def __init__(self, path: Path, key: RunKey, fresh: bool = False) -> None:
+        self.path = path
+        self.key = key
+        self._stream = self._open(fresh)
+        try:
+            self.records = self._resume()
+        except BaseException:
+            self._stream.close()
+            raise
+
+    def _open(self, fresh: bool) -> FileIO:
+        with storage_errors(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            if fresh and self.path.exists():
+                self.path.rename(_free_name(self.path))
+            stream = self.path.open("a+b", buffering=0)
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            stream.close()
+            raise RecordError(f"another evaluation is writing {self.path}. Wait for it, or give other --records.") from error
+        return stream
+
+    def _resume(self) -> list[Record]:
+        """The records already there, all of this run; a torn end is cut off."""
+        self._stream.seek(0)
+        records, sound = _parse(self.path, self._stream.read())
+        self._stream.truncate(sound)
+        for record in records:
+            differing = [name for name in IDENTITY if getattr(record, name) != getattr(self.key, name)]
+            if differing:
+                name = differing[0]
+                raise RecordError(
+                    f"{self.path} holds records of another run: `{name}` is {getattr(record, name)!r} there and "
+                    f"{getattr(self.key, name)!r} here. Give --fresh to move that file aside and start a new one.")
+        return records
+
+    @property
+    def done(self) -> set[int]:
+        """Episode seeds already recorded."""
+        return {record.episode_seed for record in self.records}
+
+    def append(self, record: Record) -> None:
+        """Write one record through to the disk."""
+        if record.episode_seed in self.done:
+            raise RecordError(f"episode seed {record.episode_seed} is in {self.path} already; a seed counts only once.")
+        line = record.to_json().encode() + b"\n"
+        start = self._stream.seek(0, os.SEEK_END)
+        with storage_errors(self.path):
+            try:
+                if self._stream.write(line) != len(line):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                os.fsync(self._stream.fileno())
+            except OSError:
+                self._stream.truncate(start)
+                raise
+        self.records.append(record)
+
+    def close(self) -> None:
+        """Release the file and its lock."""
+        self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def _free_name(path: Path) -> Path:
+    """`train0.jsonl.old-1`, or the next number that is free."""
+    taken = {sibling.name for sibling in path.parent.iterdir()}
+    number = next(n for n in range(1, len(taken) + 2) if f"{path.name}.old-{n}" not in taken)
+    return path.with_name(f"{path.name}.old-{number}")
+
+
+def read_all(root: Path) -> dict[Path, list[Record]]:
+    """Every record file below `root` with its records, in the order of their names."""
+    return {path: read_records(path) for path in sorted(root.rglob("*.jsonl"))}
+
+
+def select(records: Iterable[Record], seeds: Iterable[int]) -> list[Record]:
+    """The records of `seeds` in their order; raises RecordError when one is missing."""
+    by_seed = {record.episode_seed: record for record in records}
+    wanted = list(seeds)
+    missing = [seed for seed in wanted if seed not in by_seed]
+    if missing:
+        raise RecordError(f"{len(missing)} of {len(wanted)} episodes are not recorded (seeds {missing[:5]}...). "
+                          "Repeat the evaluation; it goes on where it stopped.")
+    return [by_seed[seed] for seed in wanted]
