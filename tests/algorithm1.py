@@ -1,0 +1,53 @@
+"""Algorithm 1, Eq. 6-8 in plain Python, one candidate at a time, as the paper states them: the search's reference."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from velap.config import PlannerConfig
+from velap.search.sampling import Noise
+from velap.search.types import SearchFns
+
+
+def reference_plan(fns: SearchFns, root: torch.Tensor, cfg: PlannerConfig, noise: Noise) -> dict[str, list]:
+    """Tree and path for one root [D] from the first row of the noise."""
+    gamma, low = fns.discount, cfg.n_sim if cfg.discard_low_exponent is None else cfg.discard_low_exponent
+    tau_std = 1 - gamma if cfg.discard_std is None else cfg.discard_std
+    q_min = lambda start, end: float(fns.reach(start, end)[0])  # noqa: E731
+    nodes, parents, values, steps, counts = [root], [-1], [float(fns.value(root))], [0.0], [0]
+    for i in range(cfg.n_iter):
+        sparse = [math.exp(-n / cfg.temperature_sparse) for n in counts]
+        value = [math.exp(q / cfg.temperature_value) for q in values]
+        uniform = 1 - cfg.p_sparse - cfg.p_value
+        weights = [cfg.p_sparse * s / sum(sparse) + cfg.p_value * v / sum(value) + uniform / len(nodes)
+                   for s, v in zip(sparse, value, strict=True)]
+        target, exp = float(noise.node[0, i]) * sum(weights), 0
+        while exp < len(nodes) - 1 and sum(weights[: exp + 1]) <= target:
+            exp += 1
+        new = nodes[exp]
+        for step in range(cfg.n_sim):
+            by_policy = float(noise.policy[0, i]) < cfg.p_policy
+            draw = noise.action[0, i, 0 if cfg.coherent_noise else step]
+            new = fns.step(new, fns.act_global(new) if by_policy else fns.propose(new, draw))
+        edge, std = (float(x) for x in fns.reach(nodes[exp], new))
+        near = [j for j, node in enumerate(nodes) if float((node - new).norm()) <= fns.d_neigh]
+        if not (edge > gamma**low and std < tau_std):
+            continue
+        if max([edge] + [q_min(nodes[j], new) for j in near]) >= gamma**cfg.discard_high_exponent:
+            continue
+        for j in near:
+            counts[j] += q_min(new, nodes[j]) > gamma**cfg.neighbour_exponent
+        counts.append(sum(q_min(nodes[j], new) > gamma**cfg.neighbour_exponent for j in near))
+        nodes.append(new)
+        parents.append(exp)
+        values.append(float(fns.value(new)))
+        steps.append(steps[exp] + math.log(edge) / math.log(gamma))
+    goals = [i for i, q in enumerate(values) if q > gamma**cfg.goal_exponent]
+    leaf = min(goals, key=steps.__getitem__) if goals else max(range(len(nodes)), key=values.__getitem__)
+    path = [leaf]
+    while path[-1]:
+        path.append(parents[path[-1]])
+    return {"nodes": nodes, "parents": parents, "values": values, "steps": steps, "counts": counts, "path": path[::-1],
+            "goals": goals}
