@@ -59,6 +59,8 @@ class ModelConfig:
     """Critics end in a sigmoid: returns of a terminal 0/1 reward lie in [0, 1]. ours; off in `paper`."""
     n_ens: int = 3
     """Members of the local ensemble, Table 7."""
+    latent_norm: bool = False
+    """Latents are normalised to zero mean and unit variance over their dimensions. ours; off in `paper`."""
     bank_size: int = 4096
     """Dataset latents kept with the model for support tests and film strips; 0 keeps none. ours; 0 in `paper`."""
 
@@ -111,6 +113,8 @@ class TrainConfig:
     """Share of goals from the future of the same trajectory (strategy b). ours."""
     relabel_other: float = 0.4
     """Share of goals from other trajectories (strategy c). ours."""
+    rewarded_share: float = 0.0
+    """Share of windows drawn to hold a rewarded transition, beyond chance. ours."""
     target_rate: float = 0.005
     """Polyak rate of the target networks (TD3's value; the paper is silent)."""
     policy_every: int = 1
@@ -121,6 +125,10 @@ class TrainConfig:
     """Windows a batch of the latent phase. ours."""
     latent_horizon: int = 10
     """Rollout length of the dynamics in the latent phase [steps]. ours."""
+    latent_heads: bool = True
+    """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
+    holdout_episodes: int = 16
+    """Unrewarded episodes kept out of training for the diagnostics. ours."""
     latent_learning_rate: float = 1e-3
     """Peak learning rate of the latent phase, cosine to a hundredth. ours."""
     precision: Precision = "bfloat16"

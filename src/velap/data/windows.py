@@ -1,0 +1,117 @@
+"""Batches of windows of consecutive frames, goals relabelled by index (App. B.4). Frames are gathered late, by row.
+
+Letters: B windows, L steps a window, M rows to encode, T value transitions, A action dimension, F frames of the store.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from velap.config import TrainConfig
+from velap.data.episodes import FrameStore, stack_indices
+from velap.data.relabel import Relabelled, relabel
+from velap.errors import DatasetError
+
+
+class Batch(NamedTuple):
+    """One sample. The first B·(L+1) of `rows` are the windows; positions index `rows`, so each frame is encoded once."""
+
+    rows: Tensor
+    """int64 [M], frame rows to encode."""
+    valid: Tensor
+    """bool [B, L], the transition lies inside its episode."""
+    actions: Tensor
+    """float32 [B, L, A] in [-1, 1]."""
+    start: Tensor
+    """int64 [T], position of z_t."""
+    action: Tensor
+    """float32 [T, A], a_t."""
+    reward: Tensor
+    """float32 [T], r_t of the task."""
+    proceeds: Tensor
+    """float32 [T], 0 where the task ended at t+1, else 1; z_{t+1} is at `start + 1`."""
+    weight: Tensor
+    """float32 [T], 1 where the transition lies inside its episode."""
+    goals: Relabelled
+    """Goals of the local learners."""
+
+
+class WindowSampler:
+    """Draws batches from a frame store; everything that sampling needs lives on `device`, frames included when asked."""
+
+    def __init__(self, store: FrameStore, config: TrainConfig, frame_stack: int, device: torch.device, holdout: np.ndarray):
+        self.config, self.frame_stack, self.device = config, frame_stack, device
+
+        def put(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(array)).to(device)
+
+        low, high = store.action_low, store.action_high
+        self.frames = put(store.frames)
+        self.actions = put(((store.actions - low) / (high - low) * 2 - 1).clip(-1, 1).astype(np.float32))
+        self.rewards = put(store.rewards)
+        self.terminated = put(store.terminated)
+        self.first = put(store.first)
+        self.last = put(store.last)
+        training = ~np.isin(store.episode_of, holdout)
+        inside = np.arange(len(store.frames)) < store.last
+        self.transitions = put(np.flatnonzero(inside & training))
+        self.rewarded = put(np.flatnonzero(inside & training & (store.rewards > 0)))
+        if len(self.transitions) == 0:
+            raise DatasetError("the dataset has no transition to train on; expected episodes of at least one step.")
+
+    def sample(self, windows: int, length: int, whole: bool, generator: torch.Generator) -> Batch:
+        """B `windows` of L `length` steps; with `whole` every transition trains the values, else only each window's first."""
+        first, last, at = self._draw_windows(windows, length, whole, generator)
+        window_rows = torch.minimum(at[:, None] + torch.arange(length + 1, device=self.device), last[:, None])
+        valid = at[:, None] + torch.arange(length, device=self.device) < last[:, None]
+        used = length if whole else 1
+        positions = torch.arange(windows * (length + 1), device=self.device).view(windows, length + 1)
+        start = positions[:, :used].reshape(-1)
+        rows = window_rows.reshape(-1)
+        chosen = rows[start]
+        extra = None
+        if not whole:
+            span = (last - chosen - 1).clamp(min=0)
+            ahead = 2 + (torch.rand(windows, generator=generator, device=self.device) * span).long()
+            extra = torch.minimum(chosen + ahead, last)
+            rows = torch.cat([rows, extra])
+        goals = relabel(rows, start, valid[:, :used].reshape(-1), valid, self.config, generator)
+        ended = self.terminated[chosen]
+        proceeds = (~ended).float()
+        return Batch(
+            rows=rows,
+            valid=valid,
+            actions=self.actions[window_rows[:, :-1]],
+            start=start,
+            action=self.actions[chosen],
+            reward=self.rewards[chosen],
+            proceeds=proceeds,
+            weight=valid[:, :used].reshape(-1).float(),
+            goals=goals._replace(proceeds=goals.proceeds * proceeds),
+        )
+
+    def stacks(self, rows: Tensor) -> Tensor:
+        """Frame stacks of rows: int64 `[*] → uint8 [*, N, H, W, 3]`."""
+        return self.frames[stack_indices(rows, self.first[rows], self.frame_stack)]
+
+    def _draw_windows(
+        self, windows: int, length: int, whole: bool, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """First row and last row of each window's episode, and the window's first row, each int64 [B]."""
+
+        def draw(pool: Tensor, n: int) -> Tensor:
+            return pool[torch.randint(len(pool), (n,), generator=generator, device=self.device)]
+
+        anchor = draw(self.transitions, windows)
+        if self.config.rewarded_share > 0 and len(self.rewarded):
+            rare = torch.rand(windows, generator=generator, device=self.device) < self.config.rewarded_share
+            anchor = torch.where(rare, draw(self.rewarded, windows), anchor)
+        first, last = self.first[anchor], self.last[anchor]
+        if not whole:
+            return first, last, anchor
+        back = torch.randint(length, (windows,), generator=generator, device=self.device)
+        return first, last, torch.maximum(torch.minimum(anchor - back, last - length), first)

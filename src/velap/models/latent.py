@@ -1,0 +1,177 @@
+"""The Eq. 1 bundle. `*` is any batch prefix, N frames a state, D latent, A action, m noise, n ensemble, P bank size."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from velap._version import __version__
+from velap.config import Config, ModelConfig, Precision
+from velap.errors import CheckpointError, VelapError
+from velap.models.generative import ConditionalVAE
+from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
+from velap.runs import load_tensors, save_tensors
+
+
+@dataclass(frozen=True)
+class Spaces:
+    """What the data look like: frame size [px] and action bounds."""
+
+    height: int
+    width: int
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+
+
+class LatentModel(nn.Module):
+    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1. Actions are in [-1, 1] inside; `to_env` and `to_unit` convert."""
+
+    def __init__(self, config: ModelConfig, spaces: Spaces, discount: float, precision: Precision = "float32") -> None:
+        super().__init__()
+        self.config, self.spaces, self.discount, self.precision = config, spaces, discount, precision
+        latent, action, norm = config.latent_dim, len(spaces.action_low), config.norm
+        self.encoder = Encoder(config, (spaces.height, spaces.width), precision)
+        self.dynamics = MLP(latent + action, config.dynamics_dense, latent, norm)
+        self.action_model = ConditionalVAE(latent, action, config.noise_dim, config.generative_dense, norm, bounded=True)
+        self.local_policy = Policy(2 * latent, config.policy_dense, action, norm)
+        self.global_policy = Policy(latent, config.policy_dense, action, norm)
+        self.local_critics = EnsembleMLP(config.n_ens, 2 * latent + action, config.critic_dense, norm)
+        self.global_critic = EnsembleMLP(1, latent + action, config.critic_dense, norm)
+        self.register_buffer("action_low", torch.tensor(spaces.action_low))
+        self.register_buffer("action_high", torch.tensor(spaces.action_high))
+        self.register_buffer("step_distance", torch.tensor(0.0))
+        self.register_buffer("bank_latents", torch.zeros(config.bank_size, latent))
+        self.register_buffer("bank_rows", torch.full((config.bank_size,), -1, dtype=torch.int32))
+        self.action_low: Tensor
+        self.action_high: Tensor
+        self.step_distance: Tensor
+        self.bank_latents: Tensor
+        self.bank_rows: Tensor
+
+    def encode(self, frames: Tensor) -> Tensor:
+        """φ: uint8 `[*, N, H, W, 3] → [*, D]`."""
+        return self.encoder(frames)
+
+    def step(self, latent: Tensor, action: Tensor) -> Tensor:
+        """h: `[*, D], [*, A] → [*, D]`."""
+        change = self.dynamics(torch.cat([latent, action], -1))
+        return latent + change if self.config.dynamics_residual else change
+
+    def propose(self, latent: Tensor, noise: Tensor) -> Tensor:
+        """g: `[*, D], [*, m] → [*, A]` in [-1, 1]."""
+        return self.action_model.decode(latent, noise)
+
+    def act_local(self, latent: Tensor, goal: Tensor) -> Tensor:
+        """π^l: `[*, D], [*, D] → [*, A]` in [-1, 1]."""
+        return self.local_policy(torch.cat([latent, goal], -1))
+
+    def act_global(self, latent: Tensor) -> Tensor:
+        """π^g: `[*, D] → [*, A]` in [-1, 1]."""
+        return self.global_policy(latent)
+
+    def local_q(self, latent: Tensor, goal: Tensor, action: Tensor) -> Tensor:
+        """Q^l of every member: `[*, D], [*, D], [*, A] → [n, *]` [Q-value]."""
+        return self.bound(self.local_critics(torch.cat([latent, goal, action], -1)))
+
+    def global_q(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Q^g: `[*, D], [*, A] → [*]` [Q-value]."""
+        return self.bound(self.global_critic(torch.cat([latent, action], -1)))[0]
+
+    def reach(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Q_min and Q_std of §4 under π^l: `[*, D], [*, D] → [*], [*]` [Q-value]; population deviation over the members."""
+        q = self.local_q(start, goal, self.act_local(start, goal))
+        return q.amin(0), q.std(0, correction=0)
+
+    def value(self, latent: Tensor) -> Tensor:
+        """Q^g(z, π^g(z)): `[*, D] → [*]` [Q-value]."""
+        return self.global_q(latent, self.act_global(latent))
+
+    def project(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Nearest latent of the dataset bank and its distance: `[*, D] → [*, D], [*]`."""
+        nearest = self.nearest_bank(latent)
+        found = self.bank_latents[nearest]
+        return found, (found - latent).norm(dim=-1)
+
+    def nearest_bank(self, latent: Tensor) -> Tensor:
+        """Index of the nearest bank latent: `[*, D] → [*]`."""
+        squares = self.bank_latents.square().sum(-1)
+        return (squares - 2 * latent @ self.bank_latents.T).argmin(-1)
+
+    def bound(self, raw: Tensor) -> Tensor:
+        """Critic output as a Q-value: a sigmoid when the config bounds it to [0, 1]."""
+        return torch.sigmoid(raw) if self.config.critic_bounded else raw
+
+    @property
+    def action_dim(self) -> int:
+        """A."""
+        return len(self.spaces.action_low)
+
+    def to_env(self, action: Tensor) -> np.ndarray:
+        """Actions `[*, A]` in [-1, 1] to float32 in the environment's bounds."""
+        scaled = self.action_low + (action.clamp(-1, 1) + 1) / 2 * (self.action_high - self.action_low)
+        return scaled.cpu().numpy().astype(np.float32)
+
+    def to_unit(self, action: Tensor) -> Tensor:
+        """Environment actions `[*, A]` to [-1, 1]."""
+        return ((action - self.action_low) / (self.action_high - self.action_low) * 2 - 1).clamp(-1, 1)
+
+    def search_fns(self, neighbour_distance_factor: float = 3.0):  # noqa: ANN201 - the type lives above this layer
+        """The callables that the search needs (`velap.search.types.SearchFns`); refuses a model in train mode."""
+        if self.training:
+            raise VelapError("the model is in train mode; expected eval mode for planning. Call model.eval() first.")
+        step_distance = float(self.step_distance)
+        return {
+            "propose": self.propose,
+            "act_global": self.act_global,
+            "step": self.step,
+            "reach": self.reach,
+            "value": self.value,
+            "project": self.project if self.config.bank_size else None,
+            "q": self.global_q,
+            "noise_dim": self.config.noise_dim,
+            "discount": self.discount,
+            "d_neigh": neighbour_distance_factor * step_distance,
+            "step_distance": step_distance,
+        }
+
+
+MODEL_FORMAT = "velap-latent-model/1"
+
+
+def save_checkpoint(path: Path, model: LatentModel, config: Config, provenance: Mapping[str, str]) -> str:
+    """One safetensors file with weights, config and provenance (command, seed, dataset hash); returns its SHA-256."""
+    metadata = {
+        **provenance,
+        "format": MODEL_FORMAT,
+        "config": config.to_json(),
+        "spaces": json.dumps(dataclasses.asdict(model.spaces)),
+        "code_version": __version__,
+    }
+    return save_tensors(path, model.state_dict(), metadata)
+
+
+def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tuple[LatentModel, Config, dict[str, str]]:
+    """Model in eval mode, its config and the metadata; raises CheckpointError on anything but an intact velap model."""
+    tensors, metadata = load_tensors(Path(path))
+    if metadata.get("format") != MODEL_FORMAT:
+        raise CheckpointError(f"{path} has format {metadata.get('format')!r}; expected {MODEL_FORMAT!r}. "
+                              "Give the `model.safetensors` of a run, not its training state.")
+    config = Config.from_json(metadata["config"])
+    raw = json.loads(metadata["spaces"])
+    spaces = Spaces(raw["height"], raw["width"], tuple(raw["action_low"]), tuple(raw["action_high"]))
+    model = LatentModel(config.model, spaces, config.train.discount, config.train.precision)
+    expected = model.state_dict()
+    wrong = sorted(name for name in expected.keys() | tensors.keys()
+                   if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape)
+    if wrong:
+        raise CheckpointError(f"{path} does not fit its own config: {len(wrong)} tensors differ, {wrong[0]} first. "
+                              "The file comes from another version of velap; train again.")
+    model.load_state_dict(tensors)
+    return model.to(device).eval().requires_grad_(False), config, metadata

@@ -1,0 +1,117 @@
+"""Networks of App. B.1 (Tables 2, 3, 5, 6). `*` is any batch prefix, D the latent and A the action dimension, n the members."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from velap.config import ModelConfig, Norm, Precision
+
+LEAK = 0.01
+"""Negative slope of the activations (PyTorch's default; the tables say LeakyReLU only)."""
+
+
+def _norm_layer(norm: Norm, width: int) -> list[nn.Module]:
+    return {"batch": [nn.BatchNorm1d(width)], "layer": [nn.LayerNorm(width)], "none": []}[norm]  # type: ignore[return-value]
+
+
+class MLP(nn.Sequential):
+    """Dense layers with LeakyReLU; `[*, inputs] → [*, outputs]`, linear at the end."""
+
+    def __init__(self, inputs: int, hidden: Sequence[int], outputs: int, norm: Norm) -> None:
+        layers: list[nn.Module] = []
+        for width in hidden:
+            layers += [nn.Linear(inputs, width), *_norm_layer(norm, width), nn.LeakyReLU(LEAK, inplace=True)]
+            inputs = width
+        super().__init__(*layers, nn.Linear(inputs, outputs))
+        self._flat = norm == "batch"
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self._flat and x.dim() != 2:
+            return super().forward(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], -1)
+        return super().forward(x)
+
+
+class EnsembleMLP(nn.Module):
+    """n independent MLPs evaluated as one batched product; `[*, inputs] → [n, *]`, one scalar a member."""
+
+    def __init__(self, n: int, inputs: int, hidden: Sequence[int], norm: Norm) -> None:
+        super().__init__()
+        self.n = n
+        self.norm = norm
+        sizes = [inputs, *hidden, 1]
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        self.scales = nn.ParameterList()
+        self.shifts = nn.ParameterList()
+        self.norms = nn.ModuleList()
+        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+            bound = fan_in**-0.5
+            self.weights.append(nn.Parameter(torch.empty(n, fan_in, fan_out).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(torch.empty(n, 1, fan_out).uniform_(-bound, bound)))
+        for width in hidden:
+            if norm == "layer":
+                self.scales.append(nn.Parameter(torch.ones(n, 1, width)))
+                self.shifts.append(nn.Parameter(torch.zeros(n, 1, width)))
+            elif norm == "batch":
+                self.norms.append(nn.BatchNorm1d(n * width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        prefix = x.shape[:-1]
+        h = x.reshape(1, -1, x.shape[-1]).expand(self.n, -1, -1)
+        for i in range(len(self.weights) - 1):
+            h = self._normalise(i, torch.baddbmm(self.biases[i], h, self.weights[i]))
+            h = F.leaky_relu(h, LEAK, inplace=True)
+        return torch.baddbmm(self.biases[-1], h, self.weights[-1]).reshape(self.n, *prefix)
+
+    def _normalise(self, i: int, h: Tensor) -> Tensor:
+        if self.norm == "layer":
+            return torch.addcmul(self.shifts[i], F.layer_norm(h, h.shape[-1:]), self.scales[i])
+        if self.norm == "batch":
+            n, m, width = h.shape
+            return self.norms[i](h.permute(1, 0, 2).reshape(m, n * width)).reshape(m, n, width).permute(1, 0, 2)
+        return h
+
+
+class Encoder(nn.Module):
+    """φ, Table 2: convolutions and dense layers; uint8 `[*, N, H, W, 3] → [*, D]`.
+
+    Layer normalisation acts on the dense layers only: over convolution maps it costs as much as the convolutions (ours).
+    """
+
+    def __init__(self, config: ModelConfig, size: tuple[int, int], precision: Precision) -> None:
+        super().__init__()
+        channels = 3 * config.frame_stack
+        height, width = size
+        layers: list[nn.Module] = []
+        for filters, kernel, stride in zip(
+            config.encoder_filters, config.encoder_kernels, config.encoder_strides, strict=True
+        ):
+            layers.append(nn.Conv2d(channels, filters, kernel, stride))
+            if config.norm == "batch":
+                layers.append(nn.BatchNorm2d(filters))
+            layers.append(nn.LeakyReLU(LEAK, inplace=True))
+            height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
+            channels = filters
+        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.dense = MLP(channels * height * width, config.encoder_dense, config.latent_dim, config.norm)
+        self.final_norm = nn.LayerNorm(config.latent_dim, elementwise_affine=False) if config.latent_norm else nn.Identity()
+        self.dtype = getattr(torch, precision)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        prefix, (n, h, w, c) = frames.shape[:-4], frames.shape[-4:]
+        x = frames.reshape(-1, n, h, w, c).permute(0, 2, 3, 1, 4).reshape(-1, h, w, n * c)
+        x = x.to(self.dtype).mul_(2 / 255).sub_(1).permute(0, 3, 1, 2)
+        with torch.autocast(frames.device.type, dtype=self.dtype, enabled=self.dtype != torch.float32):
+            x = self.convolutions(x).flatten(1)
+        return self.final_norm(self.dense(x.float())).reshape(*prefix, -1)
+
+
+class Policy(MLP):
+    """π, Table 5, tanh at the end: `[*, inputs] → [*, A]` in [-1, 1]."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.tanh(super().forward(x))

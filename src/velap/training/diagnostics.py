@@ -1,0 +1,71 @@
+"""What to look at before believing a loss curve: rollout error against displacement, and Q-values against true steps.
+
+Measured on held-out episodes. Letters: F frames, D latent, S starts.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from velap.data.windows import WindowSampler
+from velap.models.horizon import steps_from_q
+from velap.models.latent import LatentModel
+from velap.training.joint import encode_all, evaluated
+
+HORIZONS = (1, 3, 10)
+"""Rollout lengths that are reported [steps]."""
+
+
+@torch.no_grad()
+def diagnose(model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], cache: Tensor | None) -> dict[str, float]:
+    """Rollout error and displacement (in one-step lengths), and Q^l in steps, at each horizon over held-out episodes.
+
+    `episodes` are (first row, last row) pairs; `cache` [F, D] holds latents when the encoder is frozen.
+    Keys: `rollout/error_k`, `rollout/moved_k` [one-step lengths], `local/steps_k` [steps], `latent/step` [latent distance].
+    """
+    report: dict[str, float] = {}
+    with evaluated(model):
+        if cache is None:
+            rows = torch.cat([torch.arange(first, last + 1) for first, last in episodes]).to(sampler.device)
+            latents = model.encode(sampler.stacks(rows))
+            offsets = torch.cumsum(torch.tensor([0] + [last - first + 1 for first, last in episodes]), 0).tolist()
+        else:
+            rows = torch.arange(len(cache), device=sampler.device)
+            latents, offsets = cache, [first for first, _ in episodes]
+        one_step = float("nan")
+        for k in HORIZONS:
+            starts = [torch.arange(o, o + last - first + 1 - k) for o, (first, last) in zip(offsets, episodes, strict=False)
+                      if last - first >= k]
+            if not starts:
+                continue
+            start = torch.cat(starts).to(sampler.device)
+            predicted = latents[start]
+            for i in range(k):
+                predicted = model.step(predicted, sampler.actions[rows[start + i]])
+            truth = latents[start + k]
+            moved = (truth - latents[start]).norm(dim=-1).mean().item()
+            if k == 1:
+                one_step = moved
+                report["latent/step"] = one_step
+            report[f"rollout/error_{k}"] = (predicted - truth).norm(dim=-1).mean().item() / one_step
+            report[f"rollout/moved_{k}"] = moved / one_step
+            q_min, _ = model.reach(latents[start], truth)
+            report[f"local/steps_{k}"] = steps_from_q(q_min, model.discount).median().item()
+    return report
+
+
+@torch.no_grad()
+def measure_latents(model: LatentModel, sampler: WindowSampler, generator: torch.Generator) -> None:
+    """Sets `step_distance` (upper 5-percentile of one-step latent distances, Table 8) and the bank of dataset latents."""
+    latents = encode_all(model, sampler)
+    rows = sampler.transitions
+    distances = (latents[rows + 1] - latents[rows]).norm(dim=-1)
+    model.step_distance.copy_(torch.quantile(distances[:1_000_000].float(), 0.95))
+    size = model.config.bank_size
+    if size:
+        everything = torch.arange(len(latents), device=latents.device)
+        order = torch.randperm(len(everything), generator=generator, device=generator.device).to(latents.device)
+        picked = everything[order].repeat(-(-size // len(everything)))[:size].sort().values
+        model.bank_latents.copy_(latents[picked])
+        model.bank_rows.copy_(picked)

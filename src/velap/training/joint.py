@@ -1,0 +1,202 @@
+"""Joint training of the Eq. 1 bundle (Eq. 2-5, 9; App. B.4, B.5), and the latent phase that follows it (ours).
+
+Letters: M rows of a batch, T transitions, B windows, L steps a window, k rollout steps, W rollouts, D latent, A action dimension.
+Each update alternates the model (encoder, dynamics, critics) and the policies with the latents held fixed. The action model g
+learns beside the policies, on fixed latents too: Eq. 2 has no term for it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from velap.config import TrainConfig
+from velap.data.windows import Batch, WindowSampler
+from velap.models.latent import LatentModel
+from velap.training.losses import (
+    Info,
+    action_model_loss,
+    critic_loss,
+    infonce_loss,
+    policy_loss,
+    polyak,
+    reparameterise,
+    rollout_mse_loss,
+    td_target,
+)
+
+
+@contextmanager
+def evaluated(*modules: nn.Module) -> Iterator[None]:
+    """Modules that are only evaluated use running statistics (BatchNorm): targets, and critics under the policy loss."""
+    trained = [module for module in modules if module.training]
+    for module in trained:
+        module.eval()
+    try:
+        yield
+    finally:
+        for module in trained:
+            module.train()
+
+
+def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int, every_start: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """k-step predictions of h along the data's actions: predicted [k, W, D], positions int64 [k, W] of the truth, valid [k, W].
+
+    latents [M, D]; rollouts start at every step of a window that leaves k steps, or at the first one only.
+    """
+    windows, length = batch.valid.shape
+    starts = length - k + 1 if every_start else 1
+    positions = torch.arange(windows * (length + 1), device=latents.device).view(windows, length + 1)
+    latent = latents[positions[:, :starts].reshape(-1)]
+    predicted, truth, valid = [], [], []
+    for i in range(k):
+        latent = model.step(latent, batch.actions[:, i : i + starts].reshape(-1, batch.actions.shape[-1]))
+        predicted.append(latent)
+        truth.append(positions[:, i + 1 : i + 1 + starts].reshape(-1))
+        valid.append(batch.valid[:, i : i + starts].reshape(-1))
+    return torch.stack(predicted), torch.stack(truth), torch.stack(valid)
+
+
+class JointLearner:
+    """Owns the model, its target critics and the optimisers; `joint_step` and `latent_step` are single updates."""
+
+    def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
+        self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
+        self.local_target = copy.deepcopy(model.local_critics).requires_grad_(False).eval()
+        self.global_target = copy.deepcopy(model.global_critic).requires_grad_(False).eval()
+        self.cache: Tensor | None = None
+        self.updates = 0
+        self._optimise(config.learning_rate, encoder=True)
+        targets, sources = [self.local_target, self.global_target], [model.local_critics, model.global_critic]
+        self._target_pairs = (
+            [p for m in targets for p in m.parameters()],
+            [p for m in sources for p in m.parameters()],
+            [b for m in targets for b in m.buffers()],
+            [b for m in sources for b in m.buffers()],
+        )
+
+    def _optimise(self, learning_rate: float, encoder: bool) -> None:
+        """Fresh optimisers; the encoder is left out in the latent phase."""
+        model = self.model
+        parts: list[nn.Module] = [model.encoder] if encoder else []
+        parts += [model.dynamics, model.local_critics, model.global_critic]
+        self.model_parameters = [p for part in parts for p in part.parameters()]
+        acting: list[nn.Module] = [model.local_policy, model.global_policy, model.action_model]
+        self.policy_parameters = [p for part in acting for p in part.parameters()]
+        self.model_optimizer = torch.optim.Adam(self.model_parameters, learning_rate, fused=True)
+        self.policy_optimizer = torch.optim.Adam(self.policy_parameters, learning_rate, fused=True)
+
+    def joint_step(self) -> Info:
+        """One update of Eq. 2, then one of Eq. 5 and of g."""
+        config = self.config
+        batch = self.sampler.sample(config.batch_windows, config.window, config.whole_windows, self.generator)
+        latents = self.model.encode(self.sampler.stacks(batch.rows))
+        k = config.dynamics_horizon
+        predicted, truth, valid = rollouts(self.model, latents, batch, k, config.whole_windows)
+        if config.dynamics_loss == "infonce":
+            candidates = latents[: batch.valid.shape[0] * (batch.valid.shape[1] + 1)]
+            dynamics, info = infonce_loss(predicted, truth, candidates, valid, config.temperature)
+        else:
+            dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, torch.ones((), device=latents.device))
+        return self._update(latents, batch, config.c1 * dynamics, {"dynamics/loss": info["loss"]}, True)
+
+    def latent_step(self) -> Info:
+        """One update on cached latents: the dynamics by rollout error, the other heads as before (when `latent_heads`)."""
+        assert self.cache is not None, "begin_latent_phase comes first"
+        config = self.config
+        batch = self.sampler.sample(config.latent_batch, config.latent_horizon, False, self.generator)
+        latents = self.cache[batch.rows]
+        predicted, truth, valid = rollouts(self.model, latents, batch, config.latent_horizon, False)
+        dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, self.step_square)
+        return self._update(latents, batch, dynamics, {"dynamics/loss": info["loss"]}, config.latent_heads)
+
+    def begin_latent_phase(self) -> None:
+        """Freeze the encoder, cache every latent of the dataset [F, D], start fresh optimisers."""
+        self.model.encoder.requires_grad_(False).eval()
+        self.cache = encode_all(self.model, self.sampler)
+        rows = self.sampler.transitions
+        self.step_square = (self.cache[rows + 1] - self.cache[rows]).square().sum(-1).mean()
+        self._optimise(self.config.latent_learning_rate, encoder=False)
+
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """For the schedule of the latent phase."""
+        for optimizer in (self.model_optimizer, self.policy_optimizer):
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate
+
+    def _update(self, latents: Tensor, batch: Batch, dynamics: Tensor, info: Info, heads: bool) -> Info:
+        self.model_optimizer.zero_grad(set_to_none=True)
+        loss = dynamics
+        if heads:
+            values, more = self.value_loss(latents, batch)
+            loss = loss + values
+            info |= more
+        loss.backward()
+        self.model_optimizer.step()
+        self.updates += 1
+        if heads:
+            rate = self.config.target_rate
+            target, source, target_buffers, source_buffers = self._target_pairs
+            polyak(target, source, rate)
+            for old, new in zip(target_buffers, source_buffers, strict=True):
+                old.copy_(new)
+            if self.updates % self.config.policy_every == 0:
+                info |= self._update_policies(latents.detach(), batch)
+        return info
+
+    def value_loss(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
+        """1/n Σ L_Q^l + c0 · L_Q^g of Eq. 2, with the targets of Eq. 3 and 4 from the target critics."""
+        model, config, weight = self.model, self.config, batch.weight
+        now, goal = latents[batch.start], latents[batch.goals.position]
+        with torch.no_grad(), evaluated(model.local_policy, model.global_policy):
+            then, there = latents[batch.start + 1], goal.detach()
+            action = model.act_local(then, there)
+            next_local = model.bound(self.local_target(torch.cat([then, there, action], -1))).amin(0)
+            local_goal = td_target(batch.goals.reward, batch.goals.proceeds, next_local, config.discount)
+            next_global = model.bound(self.global_target(torch.cat([then, model.act_global(then)], -1)))[0]
+            global_goal = td_target(batch.reward, batch.proceeds, next_global, config.discount)
+        local, local_info = critic_loss(model.local_q(now, goal, batch.action), local_goal, weight)
+        task, task_info = critic_loss(model.global_q(now, batch.action), global_goal, weight)
+        info = {"local/loss": local_info["loss"], "local/q": local_info["q"],
+                "global/loss": task_info["loss"], "global/q": task_info["q"]}
+        return local + config.c0 * task, info
+
+    def acting_loss(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
+        """Eq. 5 for both policies, and the β-VAE of g. Only their own parameters are to take its gradient."""
+        model, config, weight = self.model, self.config, batch.weight
+        now, goal = latents[batch.start], latents[batch.goals.position]
+        local_action, global_action = model.act_local(now, goal), model.act_global(now)
+        with evaluated(model.local_critics, model.global_critic):
+            local_q = model.local_q(now, goal, local_action).amin(0)
+            global_q = model.global_q(now, global_action)
+        local, local_info = policy_loss(local_q, local_action, batch.action, config.c2, weight)
+        task, task_info = policy_loss(global_q, global_action, batch.action, config.c3, weight)
+        mean, log_variance = model.action_model.posterior(now, batch.action)
+        noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)
+        decoded = model.propose(now, reparameterise(mean, log_variance, noise))
+        proposals, g_info = action_model_loss(decoded, batch.action, mean, log_variance, config.kl_weight, weight)
+        info = {"local/policy": local_info["loss"], "local/imitation": local_info["imitation"],
+                "global/policy": task_info["loss"], "global/imitation": task_info["imitation"],
+                "g/reconstruction": g_info["reconstruction"], "g/kl": g_info["kl"]}
+        return local + task + proposals, info
+
+    def _update_policies(self, latents: Tensor, batch: Batch) -> Info:
+        self.policy_optimizer.zero_grad(set_to_none=True)
+        loss, info = self.acting_loss(latents, batch)
+        loss.backward(inputs=self.policy_parameters)
+        self.policy_optimizer.step()
+        return info
+
+
+@torch.no_grad()
+def encode_all(model: LatentModel, sampler: WindowSampler, chunk: int = 1024) -> Tensor:
+    """Latents of every frame of the dataset, float32 [F, D], running statistics."""
+    with evaluated(model):
+        rows = torch.arange(len(sampler.frames), device=sampler.device)
+        return torch.cat([model.encode(sampler.stacks(part)) for part in rows.split(chunk)])
+
+

@@ -1,0 +1,265 @@
+"""The training loop: phases, logging, diagnostics, atomic checkpoints, exact resume.
+
+A run directory holds `config.json`, `metrics.jsonl`, TensorBoard events, `state.safetensors` (everything a resume needs) and, at the
+end, `model.safetensors`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from velap.config import Config
+from velap.data.episodes import FrameStore
+from velap.data.windows import WindowSampler
+from velap.errors import CheckpointError, DatasetError, TrainingError
+from velap.models.latent import LatentModel, Spaces, save_checkpoint
+from velap.runs import MetricsLog, load_tensors, make_generator, save_tensors, write_atomic
+from velap.training.diagnostics import diagnose, measure_latents
+from velap.training.joint import JointLearner
+
+STATE, MODEL = "state.safetensors", "model.safetensors"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress view needs."""
+
+    phase: str
+    """`joint` or `latent`."""
+    step: int
+    """Updates done, both phases counted [steps]."""
+    total: int
+    """Updates of the whole run [steps]."""
+    seconds: float
+    """Training time so far, earlier sittings included [s]."""
+    info: dict[str, float]
+    """The latest losses and diagnostics."""
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """Outcome of one run."""
+
+    checkpoint: Path
+    sha256: str
+    seconds: float
+    """Training time, all sittings [s]."""
+    diagnostics: dict[str, float]
+
+
+class Trainer:
+    """One run: builds the learner, steps through the phases, saves and resumes."""
+
+    def __init__(self, config: Config, store: FrameStore, run_dir: Path, seed: int, device: torch.device) -> None:
+        self.config, self.store, self.run_dir, self.seed, self.device = config, store, Path(run_dir), seed, device
+        train = config.train
+        self.holdout = self._holdout()
+        self.sampler = WindowSampler(store, train, config.model.frame_stack, device, self.holdout)
+        self._check_lengths()
+        height, width = store.frames.shape[1:3]
+        spaces = Spaces(height, width, tuple(map(float, store.action_low)), tuple(map(float, store.action_high)))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.model = LatentModel(config.model, spaces, train.discount, train.precision).to(device).train()
+        self.generator = make_generator(seed, stream=1, device=device)
+        self.learner = JointLearner(self.model, train, self.sampler, self.generator)
+        self.step, self.seconds = 0, 0.0
+
+    @property
+    def total(self) -> int:
+        """Updates of both phases [steps]."""
+        return self.config.train.joint_steps + self.config.train.latent_steps
+
+    def _holdout(self) -> np.ndarray:
+        """Episodes kept for the diagnostics: unrewarded ones, at most a tenth of the data."""
+        starts, lengths = self.store.episode_start, self.store.episode_length
+        plain = [e for e in range(len(starts)) if not self.store.rewards[starts[e] : starts[e] + lengths[e]].any()]
+        n = min(self.config.train.holdout_episodes, len(starts) // 10, len(plain))
+        return np.random.default_rng([self.seed, 7]).permutation(np.array(plain, dtype=np.int64))[:n]
+
+    def _check_lengths(self) -> None:
+        longest, k = int(self.store.episode_length.max()), self.config.train.dynamics_horizon
+        if longest < k:
+            raise DatasetError(f"the longest episode has {longest} steps; the dynamics loss needs at least dynamics_horizon = {k}. "
+                               "Collect longer episodes or lower `dynamics_horizon`.")
+
+    def update(self) -> dict[str, Tensor]:
+        """One update of the current phase."""
+        train = self.config.train
+        if self.step < train.joint_steps:
+            info = self.learner.joint_step()
+        else:
+            if self.learner.cache is None:
+                self.learner.begin_latent_phase()
+            done = (self.step - train.joint_steps) / max(train.latent_steps, 1)
+            self.learner.set_learning_rate(train.latent_learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done))))
+            info = self.learner.latent_step()
+        self.step += 1
+        return info
+
+    def report(self) -> dict[str, float]:
+        """Diagnostics on held-out episodes."""
+        episodes = [(int(self.store.episode_start[e]), int(self.store.episode_start[e] + self.store.episode_length[e]))
+                    for e in self.holdout]
+        return diagnose(self.model, self.sampler, episodes, self.learner.cache) if episodes else {}
+
+    def save(self) -> None:
+        """Everything a resume needs, in one atomic file."""
+        learner = self.learner
+        tensors = {f"model/{k}": v for k, v in self.model.state_dict().items()}
+        for name, module in (("local", learner.local_target), ("global", learner.global_target)):
+            tensors |= {f"target/{name}/{k}": v for k, v in module.state_dict().items()}
+        for name, optimizer in (("model", learner.model_optimizer), ("policy", learner.policy_optimizer)):
+            for index, state in optimizer.state_dict()["state"].items():
+                tensors |= {f"optimizer/{name}/{index}/{k}": torch.as_tensor(v) for k, v in state.items()}
+        tensors["generator"] = self.generator.get_state()
+        metadata = {
+            "format": "velap-training-state/1", "config": self.config.to_json(), "seed": str(self.seed), "step": str(self.step),
+            "updates": str(learner.updates), "seconds": repr(self.seconds), "dataset": self.store.content_hash,
+            "latent_phase": str(int(learner.cache is not None)),
+        }
+        save_tensors(self.run_dir / STATE, tensors, metadata)
+
+    def resume(self) -> None:
+        """Continue from `state.safetensors`; raises CheckpointError when it belongs to another run."""
+        path = self.run_dir / STATE
+        tensors, metadata = load_tensors(path)
+        expected = {"config": self.config.to_json(), "seed": str(self.seed), "dataset": self.store.content_hash}
+        for key, value in expected.items():
+            if metadata.get(key) != value:
+                got = metadata.get(key, "nothing")
+                raise CheckpointError(f"{path} was made with another {key} ({got[:120]}…; this command has {value[:120]}…). "
+                                      "Resume with the same task, preset, seed and dataset, or start a new run elsewhere.")
+        learner = self.learner
+        self.model.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model/")})
+        if metadata["latent_phase"] == "1":
+            learner.begin_latent_phase()
+        for name, module in (("local", learner.local_target), ("global", learner.global_target)):
+            prefix = f"target/{name}/"
+            module.load_state_dict({k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)})
+        for name, optimizer in (("model", learner.model_optimizer), ("policy", learner.policy_optimizer)):
+            state: dict[int, dict[str, Tensor]] = {}
+            for key, value in tensors.items():
+                if key.startswith(f"optimizer/{name}/"):
+                    _, _, index, field = key.split("/")
+                    state.setdefault(int(index), {})[field] = value
+            optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+        self.generator.set_state(tensors["generator"])
+        self.step, learner.updates, self.seconds = int(metadata["step"]), int(metadata["updates"]), float(metadata["seconds"])
+
+    def finish(self, command: str) -> TrainResult:
+        """Measure the latents, keep the bank, write the released form of the model."""
+        diagnostics = self.report()
+        self.model.eval()
+        measure_latents(self.model, self.sampler, make_generator(self.seed, stream=2))
+        provenance = {
+            "command": command, "seed": str(self.seed), "dataset_id": self.store.dataset_id, "dataset_hash": self.store.content_hash,
+            "train_seconds": f"{self.seconds:.0f}", "diagnostics": json.dumps(diagnostics), "steps": str(self.step),
+        }
+        path = self.run_dir / MODEL
+        digest = save_checkpoint(path, self.model, self.config, provenance)
+        return TrainResult(path, digest, self.seconds, diagnostics)
+
+
+def train(
+    config: Config,
+    store: FrameStore,
+    run_dir: Path,
+    *,
+    seed: int = 0,
+    device: str = "auto",
+    resume: bool = False,
+    command: str = "velap.train",
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> TrainResult:
+    """Train to the end. Ctrl-C saves the state and raises KeyboardInterrupt; `resume` goes on from there, to the same bits on CPU.
+
+    Raises CheckpointError when `run_dir` holds another run, or an unfinished one and `resume` is off.
+    """
+    run_dir = Path(run_dir)
+    trainer = Trainer(config, store, run_dir, seed, pick_device(device))
+    resumed = None
+    if (run_dir / STATE).exists():
+        if not resume:
+            raise CheckpointError(f"{run_dir} already holds a run. Add --resume to go on with it, or give another --out.")
+        trainer.resume()
+        resumed = trainer.step
+    write_atomic(run_dir / "config.json", config.to_json().encode())
+    log = MetricsLog(run_dir / "metrics.jsonl", resumed)
+    with interrupt_flag() as interrupted:
+        _run(trainer, log, on_progress, interrupted)
+    trainer.save()
+    if trainer.step < trainer.total:
+        raise KeyboardInterrupt
+    return trainer.finish(command)
+
+
+@contextmanager
+def interrupt_flag() -> Iterator[threading.Event]:
+    """Ctrl-C sets the flag instead of breaking an update in two; a second one raises at once."""
+    flag = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: FrameType | None) -> None:
+        flag.set()
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def pick_device(device: str) -> torch.device:
+    """`auto` takes CUDA where it is found, else the CPU."""
+    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
+
+
+def _run(
+    trainer: Trainer, log: MetricsLog, on_progress: Callable[[Progress], None], interrupted: threading.Event
+) -> None:
+    from torch.utils.tensorboard import SummaryWriter
+
+    train = trainer.config.train
+    writer = SummaryWriter(str(trainer.run_dir / "tensorboard"), purge_step=trainer.step)
+    clock = time.monotonic()
+    while trainer.step < trainer.total and not interrupted.is_set():
+        info = trainer.update()
+        row: dict[str, float] = {}
+        last = trainer.step == trainer.total
+        if trainer.step % train.log_every == 0 or last:
+            row |= {name: float(value) for name, value in info.items()}
+            bad = sorted(name for name, value in row.items() if not math.isfinite(value))
+            if bad:
+                raise TrainingError(f"{', '.join(bad)} became NaN or infinite at step {trainer.step}. The last good state is in "
+                                    f"{trainer.run_dir / STATE}; lower the learning rate or check the data for bad actions.")
+        if trainer.step % train.diagnose_every == 0 or last:
+            row |= trainer.report()
+        now = time.monotonic()
+        trainer.seconds, clock = trainer.seconds + now - clock, now
+        if row:
+            phase = "joint" if trainer.step <= train.joint_steps else "latent"
+            log.append({"step": trainer.step, "phase": phase, "seconds": round(trainer.seconds, 1), **row})
+            for name, value in row.items():
+                writer.add_scalar(name, value, trainer.step)
+            on_progress(Progress(phase, trainer.step, trainer.total, trainer.seconds, row))
+        if trainer.step % train.checkpoint_every == 0:
+            trainer.save()
+    writer.close()

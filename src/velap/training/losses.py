@@ -1,0 +1,87 @@
+"""Losses, one function an equation, each `(loss, info)`. Letters: T transitions, n ensemble members, k rollout steps, W rollouts,
+C candidates, D latent, A action dimension. `weight` [T] is 1 for real transitions and 0 for padding.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+Info = dict[str, Tensor]
+
+
+def weighted_mean(value: Tensor, weight: Tensor) -> Tensor:
+    """Mean of `value` [*, T] over real transitions; leading dimensions are averaged."""
+    return (value * weight).mean(tuple(range(value.dim() - 1))).sum() / weight.sum().clamp(min=1)
+
+
+def td_target(reward: Tensor, proceeds: Tensor, next_q: Tensor, discount: float) -> Tensor:
+    """r + γ · proceeds · Q(s', π(s')), Eq. 3 and 4; no gradient. All [T]; `proceeds` is 0 at terminals."""
+    return (reward + discount * proceeds * next_q).detach()
+
+
+def critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Info]:
+    """Squared TD error, Eq. 3 and 4, mean over members. q [n, T] or [T], target [T] [Q-value]."""
+    loss = weighted_mean((q - target).square(), weight)
+    return loss, {"loss": loss.detach(), "q": weighted_mean(q.detach(), weight)}
+
+
+def policy_loss(q: Tensor, action: Tensor, data_action: Tensor, imitation: float, weight: Tensor) -> tuple[Tensor, Info]:
+    """-Q + c · (π - a)², Eq. 5. q [T], actions [T, A] in [-1, 1]; the square is averaged over A, as TD3-BC does."""
+    cloning = weighted_mean((action - data_action).square().mean(-1), weight)
+    loss = imitation * cloning - weighted_mean(q, weight)
+    return loss, {"loss": loss.detach(), "imitation": cloning.detach()}
+
+
+def latent_distances(a: Tensor, b: Tensor) -> Tensor:
+    """Euclidean distances `[*, W, D], [*, C, D] → [*, W, C]`, with a finite gradient at zero."""
+    squares = a.square().sum(-1, keepdim=True) + b.square().sum(-1).unsqueeze(-2) - 2 * a @ b.transpose(-1, -2)
+    return squares.clamp(min=1e-6).sqrt()
+
+
+def infonce_loss(
+    predicted: Tensor, positive: Tensor, candidates: Tensor, valid: Tensor, temperature: float
+) -> tuple[Tensor, Info]:
+    """Contrastive dynamics loss, Eq. 9: mean over the k steps of -log f(z̃, z⁺) / Σ_j f(z̃, z_j), f = exp(-‖·‖/T).
+
+    predicted [k, W, D]; positive int64 [k, W], the row of `candidates` [C, D] that is the true latent; valid bool [k, W].
+    The sum runs over all candidates, the positive one included.
+    """
+    logits = -latent_distances(predicted, candidates) / temperature
+    log_share = logits.log_softmax(-1).gather(-1, positive.unsqueeze(-1)).squeeze(-1)
+    counted = valid.float()
+    a_step = -(log_share * counted).sum(1) / counted.sum(1).clamp(min=1)
+    loss = a_step.mean()
+    return loss, {"loss": loss.detach()}
+
+
+def rollout_mse_loss(predicted: Tensor, actual: Tensor, valid: Tensor, scale: Tensor) -> tuple[Tensor, Info]:
+    """Mean-squared rollout error (App. E.3) over real steps, in units of `scale`² (mean square one-step change; [] or 1).
+
+    predicted, actual [k, W, D]; valid bool [k, W]. No gradient flows into `actual`.
+    """
+    squares = (predicted - actual.detach()).square().sum(-1) / scale
+    counted = valid.float()
+    loss = (squares * counted).sum() / counted.sum().clamp(min=1)
+    return loss, {"loss": loss.detach()}
+
+
+def action_model_loss(
+    decoded: Tensor, action: Tensor, mean: Tensor, log_variance: Tensor, kl_weight: float, weight: Tensor
+) -> tuple[Tensor, Info]:
+    """β-VAE of Table 4: ‖a - â‖² + β · KL(q(noise | z, a) ‖ N(0, 1)). decoded, action [T, A]; mean, log_variance [T, m]."""
+    reconstruction = weighted_mean((decoded - action).square().sum(-1), weight)
+    divergence = weighted_mean(0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1), weight)
+    loss = reconstruction + kl_weight * divergence
+    return loss, {"loss": loss.detach(), "reconstruction": reconstruction.detach(), "kl": divergence.detach()}
+
+
+def reparameterise(mean: Tensor, log_variance: Tensor, noise: Tensor) -> Tensor:
+    """Posterior sample [T, m] from standard noise [T, m]."""
+    return mean + (0.5 * log_variance).exp() * noise
+
+
+@torch.no_grad()
+def polyak(targets: list[Tensor], sources: list[Tensor], rate: float) -> None:
+    """targets ← (1 - rate) · targets + rate · sources, in place."""
+    torch._foreach_lerp_(targets, sources, rate)
