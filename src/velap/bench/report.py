@@ -73,8 +73,8 @@ def summarise(records: Sequence[Record]) -> Summary:
     )
 
 
-COLUMNS = ("task", "method", "preset", "train seed", "episodes", "success [%]", "95 % interval [%]", "steps of successes",
-           "steps of all", "plan p50 [ms]", "plan p95 [ms]")
+COLUMNS = ("task", "method", "preset", "train seed", "episodes", "success [%] (95 % interval)", "steps: solved / all",
+           "plan p50 / p95 [ms]")
 
 
 def cells(summary: Summary) -> tuple[str, ...]:
@@ -82,17 +82,26 @@ def cells(summary: Summary) -> tuple[str, ...]:
     def number(value: float) -> str:
         return "-" if math.isnan(value) else f"{value:.1f}"
 
+    interval = f"{100 * summary.wilson_low:.1f} to {100 * summary.wilson_high:.1f}"
     return (summary.task, summary.method, summary.preset, str(summary.train_seed), str(summary.episodes),
-            number(100 * summary.success_rate), f"{100 * summary.wilson_low:.1f} to {100 * summary.wilson_high:.1f}",
-            number(summary.mean_success_steps), number(summary.mean_steps), number(summary.plan_ms_p50),
-            number(summary.plan_ms_p95))
+            f"{100 * summary.success_rate:.1f} ({interval})",
+            f"{number(summary.mean_success_steps)} / {number(summary.mean_steps)}",
+            f"{number(summary.plan_ms_p50)} / {number(summary.plan_ms_p95)}")
 
 
 def rich_table(summaries: Iterable[Summary]) -> Table:
-    """The table for a terminal."""
+    """The table of several runs for a terminal."""
     table = Table(*COLUMNS)
     for summary in summaries:
         table.add_row(*cells(summary))
+    return table
+
+
+def summary_table(summary: Summary) -> Table:
+    """One run for a terminal, a line a number."""
+    table = Table(show_header=False)
+    for name, cell in zip(COLUMNS, cells(summary), strict=True):
+        table.add_row(name, cell)
     return table
 
 

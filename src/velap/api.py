@@ -1,0 +1,132 @@
+"""The Python interface: what the command line does, in five lines.
+
+    dataset = velap.make_dataset("SpiralMaze", seed=0)
+    checkpoint = velap.train(dataset, seed=0)
+    agent = velap.load(checkpoint)
+    action = agent.act(frames)          # uint8 [B, N, H, W, 3] -> float32 [B, A]
+    print(velap.evaluate("SpiralMaze", checkpoint, episodes=100).success_rate)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+
+from velap.config import Config, override
+from velap.tasks import TASKS, get_task, make_config
+
+if TYPE_CHECKING:
+    from velap.agents.base import Agent
+    from velap.bench.report import Summary
+    from velap.training.loop import Progress
+
+RECORDS = Path("results/records")
+"""Where evaluations keep their episode records."""
+
+Changes = Mapping[str, Mapping[str, Any]]
+"""Config fields to replace: `{"train": {"joint_steps": 2000}}`."""
+
+
+def task_of(task_or_dataset: str) -> str:
+    """The task that a dataset id belongs to; the id itself where it is a stranger's."""
+    if task_or_dataset in TASKS:
+        return task_or_dataset
+    return next((task.name for task in TASKS.values() if task.dataset_id == task_or_dataset), task_or_dataset)
+
+
+def config_for(task: str, preset: str, changes: Changes | None) -> Config:
+    """The preset's config of a task or foreign dataset with `changes` applied."""
+    return override(make_config(task, preset), **{part: dict(fields) for part, fields in (changes or {}).items()})
+
+
+def run_dir(task: str, preset: str, seed: int) -> Path:
+    """Where a training run lives unless said otherwise."""
+    return Path("runs") / task.replace("/", "_") / preset / f"seed{seed}"
+
+
+def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwrite: bool = False) -> str:
+    """Collect the dataset of a task (Table 10) and return its Minari id.
+
+    Args:
+        task: name from `velap.tasks.TASKS`.
+        seed: decides every array, whatever the number of workers.
+        workers: processes; None takes one a core.
+        overwrite: replace a dataset of that id.
+    """
+    from velap.data.collect import collect
+
+    return collect(get_task(task), seed=seed, workers=workers, overwrite=overwrite).dataset_id
+
+
+def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Path | None = None, *,
+          image_key: str | None = None, device: str = "auto", resume: bool = False, changes: Changes | None = None,
+          command: str = "velap.train", on_progress: Callable[[Progress], None] = lambda progress: None) -> Path:
+    """Train on a task's dataset, or on any Minari dataset with images and a sparse reward; returns the checkpoint.
+
+    Args:
+        task_or_dataset: task name, or Minari dataset id.
+        preset: `default` or `paper`.
+        seed: decides weights and batches.
+        out: run directory; None takes `runs/<task>/<preset>/seed<seed>`.
+        image_key: key of the image in dict observations.
+        device: `auto`, `cpu` or `cuda`.
+        resume: go on with an unfinished run in `out`.
+        changes: config fields to replace.
+        command: kept in the checkpoint as its origin.
+        on_progress: called after every logged step.
+    """
+    from velap.data.episodes import load_store
+    from velap.training.loop import train as run
+
+    task = task_of(task_or_dataset)
+    config = config_for(task, preset, changes)
+    dataset_id = TASKS[task_or_dataset].dataset_id if task_or_dataset in TASKS else task_or_dataset
+    store = load_store(dataset_id, image_key, min_length=config.train.dynamics_horizon)
+    result = run(config, store, out or run_dir(task, preset, seed), seed=seed, device=device, resume=resume, command=command,
+                 on_progress=on_progress)
+    return result.checkpoint
+
+
+def load(checkpoint: Path | str, method: str = "velap", device: str = "auto") -> Agent:
+    """An agent that acts by a checkpoint: `reset(mask, seeds)` at the start of episodes, then `act(frames)`.
+
+    Args:
+        checkpoint: `model.safetensors` of a run.
+        method: `velap`, or `td3bc` for π^g alone.
+        device: `auto`, `cpu` or `cuda`.
+    """
+    from velap.agents.base import make_agent
+    from velap.models.latent import load_checkpoint
+    from velap.training.loop import pick_device
+
+    model, config, _ = load_checkpoint(Path(checkpoint), pick_device(device))
+    bounds = np.array([model.spaces.action_low, model.spaces.action_high], np.float32)
+    return make_agent(method, model, config, gym.spaces.Box(bounds[0], bounds[1], dtype=np.float32))
+
+
+def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,
+             first_seed: int = 0, env: str | None = None, records: Path | str = RECORDS, fresh: bool = False,
+             device: str = "auto") -> Summary:
+    """Success rate and more over seeded test episodes; goes on where an earlier call with the same records stopped.
+
+    Args:
+        task: task name; with `env`, any label.
+        checkpoint: `model.safetensors` of a run; `random` needs none.
+        method: `velap`, `td3bc` or `random`.
+        episodes: number of episodes.
+        first_seed: seed of the first one; test seeds are 0 to 99.
+        env: any Gymnasium id instead of the task's own environment.
+        records: root of the record files.
+        fresh: move an existing record file aside first.
+        device: `auto`, `cpu` or `cuda`.
+    """
+    from velap.bench.evaluate import Evaluation
+    from velap.bench.evaluate import evaluate as run
+    from velap.bench.report import summarise
+
+    what = Evaluation(task, method, Path(checkpoint) if checkpoint is not None else None, env=env, device=device)
+    return summarise(run(what, range(first_seed, first_seed + episodes), Path(records), fresh=fresh))

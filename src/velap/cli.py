@@ -1,0 +1,258 @@
+"""The command line. Heavy imports wait inside the commands, so that help and wrong options answer at once."""
+
+from __future__ import annotations
+
+import ast
+import shlex
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from velap.errors import ConfigError, VelapError
+
+OUT = Console(highlight=False)
+ERR = Console(stderr=True, highlight=False)
+
+Task = Annotated[Positional[str], arg(help="Task name, see `velap info`.")]
+Preset = Annotated[Literal["default", "paper"], arg(help="`paper` is Tables 2-10 alone, `default` what measured best.")]
+Method = Annotated[Literal["velap", "td3bc", "random"], arg(help="VELAP, π^g alone, or uniform actions.")]
+Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="`auto` takes CUDA where there is one.")]
+Settings = Annotated[tuple[str, ...], arg(name="set", help="Config fields to replace, such as `planner.n_iter=500`.")]
+Records = Annotated[Path, arg(help="Root of the episode records.")]
+
+
+def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: str | None = None,
+            overwrite: bool = False) -> None:
+    """Collect the dataset of a task (Table 10) as a Minari dataset.
+
+    Args:
+        seed: Decides every array, whatever the number of workers.
+        workers: Processes; one a core unless said.
+        dataset_id: Minari id to write; the task's own unless said.
+        overwrite: Replace a dataset of that id.
+    """
+    from velap.bench.console import View
+    from velap.data.collect import collect as run
+    from velap.tasks import get_task
+
+    recipe = get_task(task).recipe
+    with View(OUT, f"collecting {task}", recipe.contexts * recipe.trajectories) as view:
+        result = run(task, seed, workers, dataset_id, overwrite, progress=lambda done, _: view.show(done),
+                     command=_command())
+    for note in result.notes:
+        ERR.print(f"note: {note}", markup=False)
+    OUT.print(f"dataset {result.dataset_id} in {result.path}\n"
+              f"{result.episodes} episodes, {result.transitions} transitions, {result.successes} successful "
+              f"({result.success_percent:.3f} %), {result.seconds:.0f} s\ncontent hash {result.content_hash}", markup=False)
+
+
+def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: str | None = None,
+          preset: Preset = "default", seed: int = 0, out: Path | None = None, device: Device = "auto", resume: bool = False,
+          settings: Settings = ()) -> None:
+    """Train on a task's dataset or on any Minari dataset with images and a sparse reward.
+
+    Args:
+        task: Task name; leave it out with --dataset.
+        dataset: Minari dataset id.
+        image_key: Key of the image in dict observations.
+        seed: Decides weights and batches.
+        out: Run directory; runs/TASK/PRESET/seedSEED unless said.
+        resume: Go on with the unfinished run in the run directory.
+    """
+    if (task is None) == (dataset is None):
+        raise ConfigError(f"got the task {task!r} and the dataset {dataset!r}; expected one of them: `velap train TASK` or "
+                          "`velap train --dataset ID`.")
+    if task is not None:
+        from velap.tasks import get_task
+
+        get_task(task)
+    checkpoint = _train(str(task or dataset), preset, seed, out, image_key, device, resume, settings)
+    OUT.print(f"checkpoint {checkpoint}", markup=False)
+
+
+def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str | None, device: str, resume: bool,
+           settings: Sequence[str]) -> Path:
+    """Train with a progress bar; returns the checkpoint."""
+    from velap import api
+    from velap.bench.console import TrainView
+
+    view = TrainView(OUT)
+    directory = out or api.run_dir(api.task_of(source), preset, seed)
+    try:
+        return api.train(source, preset, seed, directory, image_key=image_key, device=device, resume=resume,
+                         changes=parse_settings(settings), command=_command(), on_progress=view)
+    except KeyboardInterrupt:
+        ERR.print(f"stopped; the state is in {directory}, --resume goes on with it", markup=False)
+        raise
+    finally:
+        view.close()
+
+
+def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap", episodes: int = 100, first_seed: int = 0,
+             env: str | None = None, image_key: str | None = None, max_steps: int | None = None, preset: Preset = "default",
+             records: Records = Path("results/records"), fresh: bool = False, batch: int = 10, video: bool = False,
+             device: Device = "auto", settings: Settings = ()) -> None:
+    """Run seeded test episodes and record each; repeat the command to go on where it stopped.
+
+    Args:
+        checkpoint: `model.safetensors` of a run; `random` needs none.
+        episodes: Number of episodes.
+        first_seed: Seed of the first one; test seeds are 0 to 99.
+        env: Any Gymnasium id, `module:Env-v0` included, instead of the task's own; TASK is then any label.
+        image_key: Key of the image in dict observations.
+        max_steps: Time limit where the environment has none.
+        fresh: Move an existing record file aside first.
+        batch: Environments at once.
+        video: Film the first episode as well.
+    """
+    from velap.bench.evaluate import Evaluation
+
+    what = Evaluation(task, method, checkpoint, preset, env, image_key, max_steps, device, parse_settings(settings))
+    _evaluate(what, range(first_seed, first_seed + episodes), records, fresh, batch, video)
+
+
+def _evaluate(what: Any, seeds: range, records: Path, fresh: bool, batch: int, video: bool) -> None:
+    """Evaluate with a progress bar and print the summary."""
+    from velap.bench.console import EpisodeView
+    from velap.bench.evaluate import evaluate as run
+    from velap.bench.evaluate import load_player
+    from velap.bench.report import summarise, summary_table
+
+    player = load_player(what)
+    with EpisodeView(OUT, f"{what.method} on {what.task}", len(seeds)) as view:
+        results = run(what, seeds, records, batch=batch, fresh=fresh, on_record=view, player=player)
+    OUT.print(summary_table(summarise(results)))
+    OUT.print(f"records {player.key.path(records)}", markup=False)
+    if video:
+        from velap.bench.video import film
+
+        path = Path("runs/videos") / player.key.path(Path()).with_suffix("") / f"episode{seeds[0]}.mp4"
+        film(player, [seeds[0]], path)
+        OUT.print(f"video {path}", markup=False)
+
+
+def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 100, out: Path | None = None,
+        records: Records = Path("results/records"), workers: int | None = None, device: Device = "auto",
+        settings: Settings = ()) -> None:
+    """Collect (if the dataset is missing), train and evaluate in one go; repeat the command to go on where it stopped.
+
+    Args:
+        seed: Decides weights and batches.
+        episodes: Test episodes, seeds from 0.
+        out: Run directory; runs/TASK/PRESET/seedSEED unless said.
+        workers: Processes that collect; one a core unless said.
+    """
+    from velap.bench.evaluate import Evaluation
+    from velap.data import minari_io
+    from velap.tasks import get_task
+
+    if not minari_io.dataset_path(get_task(task).dataset_id).exists():
+        collect(task, workers=workers)
+    checkpoint = _train(task, preset, seed, out, None, device, True, settings)
+    OUT.print(f"checkpoint {checkpoint}", markup=False)
+    _evaluate(Evaluation(task, checkpoint=checkpoint, device=device), range(episodes), records, False, 10, False)
+
+
+def table(records: Records = Path("results/records"), write: Path | None = None) -> None:
+    """Print the results table of all records, or write it into a document between its table marks.
+
+    Args:
+        write: Document to update, such as README.md.
+    """
+    from velap.bench.report import markdown_table, rich_table, summarise_all, write_into
+
+    summaries = summarise_all(records)
+    if write is None:
+        OUT.print(rich_table(summaries))
+    else:
+        write_into(write, markdown_table(summaries))
+        OUT.print(f"table written into {write}", markup=False)
+
+
+def demo(task: Positional[str] = "SpiralMaze", checkpoint: Path | None = None, episodes: int = 10,
+         out: Path = Path("runs/demo"), device: Device = "auto") -> None:
+    """Solve test episodes live with the released checkpoint; writes a video and a picture of plan and latent space.
+
+    Args:
+        task: Task name.
+        checkpoint: Another checkpoint than the released one.
+        episodes: Test episodes, seeds from 0.
+        out: Where the video and the picture go.
+    """
+    from velap.bench.demo import run_demo
+
+    run_demo(OUT, task, checkpoint, episodes, out, device)
+
+
+def bench(json: Path | None = None, device: Device = "auto") -> None:
+    """Measure the speed ratios side by side and print them.
+
+    Args:
+        json: Write them to this file as well, such as results/bench/cpu.json.
+    """
+    from velap.bench.speed import run_benchmarks
+
+    run_benchmarks(OUT, json, device)
+
+
+def info() -> None:
+    """Versions, tasks and what this machine offers."""
+    from velap.bench.info import describe
+
+    OUT.print(describe(), markup=False, soft_wrap=True)
+
+
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "demo": demo, "collect": collect, "train": train, "evaluate": evaluate, "run": run, "table": table, "bench": bench,
+    "info": info,
+}
+
+
+PARTS = ("model", "train", "planner", "controller")
+
+
+def parse_settings(settings: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """`["planner.n_iter=500"]` -> `{"planner": {"n_iter": 500}}`; raises ConfigError on any other form."""
+    changes: dict[str, dict[str, Any]] = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        part, dot, field = name.partition(".")
+        if not (equals and dot and part in PARTS):
+            raise ConfigError(f"--set got {setting!r}; expected PART.FIELD=VALUE; parts are {', '.join(PARTS)}.")
+        try:
+            value = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            value = text
+        changes.setdefault(part, {})[field] = value
+    return changes
+
+
+def _command() -> str:
+    """The command as it was typed, for provenance."""
+    return shlex.join(["velap", *sys.argv[1:]])
+
+
+def _show_warning(message: Warning | str, *_: Any) -> None:
+    ERR.print(f"note: {message}", markup=False)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0, 2 after an error that says what to do, 130 after Ctrl-C."""
+    warnings.filterwarnings("default", category=UserWarning, module=r"velap\..*")
+    warnings.showwarning = _show_warning  # type: ignore[assignment]
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS, prog="velap", description="Value-guided expansive latent planning (VELAP, CoRL 2023).", args=arguments,
+            config=(tyro.conf.PositionalMetavarFromFieldName, tyro.conf.FlagCreatePairsOff))
+    except VelapError as error:
+        ERR.print(f"velap: {error}", style="red", markup=False, soft_wrap=True)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
