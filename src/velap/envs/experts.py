@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from velap.envs.geometry import Layout
 
-_CLEARANCE = 0.02
-"""Room that the expert keeps to the walls [m], a third of a step: turning a corner it does not scrape along them."""
+_CLEARANCE = 0.005
+"""Room that the expert keeps to the walls [m], a tenth of a step: turning a corner it does not scrape along them."""
 
 
 def follow_shortest_path(layout: Layout, position: NDArray[np.float64], step_length: float) -> NDArray[np.float32]:
