@@ -20,6 +20,10 @@ from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
 from velap.runs import load_tensors, save_tensors
 
 
+UNREWARDED = -4.0
+"""Initial logit of bounded critics: sparse returns start near 0; from a half they would take thousands of updates to decay."""
+
+
 @dataclass(frozen=True)
 class Spaces:
     """What the data look like: frame size [px] and action bounds."""
@@ -44,6 +48,9 @@ class LatentModel(nn.Module):
         self.global_policy = Policy(latent, config.policy_dense, action, norm)
         self.local_critics = EnsembleMLP(config.n_ens, 2 * latent + action, config.critic_dense, norm)
         self.global_critic = EnsembleMLP(1, latent + action, config.critic_dense, norm)
+        if config.critic_bounded:
+            for critic in (self.local_critics, self.global_critic):
+                nn.init.constant_(critic.biases[-1], UNREWARDED)
         self.register_buffer("action_low", torch.tensor(spaces.action_low))
         self.register_buffer("action_high", torch.tensor(spaces.action_high))
         self.register_buffer("step_distance", torch.tensor(0.0))

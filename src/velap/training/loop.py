@@ -151,11 +151,15 @@ class Trainer:
             prefix = f"target/{name}/"
             module.load_state_dict({k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)})
         for name, optimizer in (("model", learner.model_optimizer), ("policy", learner.policy_optimizer)):
+            parameters = optimizer.param_groups[0]["params"]
             state: dict[int, dict[str, Tensor]] = {}
             for key, value in tensors.items():
                 if key.startswith(f"optimizer/{name}/"):
                     _, _, index, field = key.split("/")
-                    state.setdefault(int(index), {})[field] = value
+                    # Same strides as the parameter (convolutions are channels_last): the fused update walks memory.
+                    like = parameters[int(index)]
+                    kept = torch.empty_like(like).copy_(value) if value.shape == like.shape else value
+                    state.setdefault(int(index), {})[field] = kept
             optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
         self.generator.set_state(tensors["generator"])
         self.step, learner.updates, self.seconds = int(metadata["step"]), int(metadata["updates"]), float(metadata["seconds"])

@@ -12,7 +12,8 @@ Info = dict[str, Tensor]
 
 def weighted_mean(value: Tensor, weight: Tensor) -> Tensor:
     """Mean of `value` [*, T] over real transitions; leading dimensions are averaged."""
-    return (value * weight).mean(tuple(range(value.dim() - 1))).sum() / weight.sum().clamp(min=1)
+    total = (value * weight).flatten(0, -2).sum(-1).mean() if value.dim() > 1 else (value * weight).sum()
+    return total / weight.sum().clamp(min=1)
 
 
 def td_target(reward: Tensor, proceeds: Tensor, next_q: Tensor, discount: float) -> Tensor:

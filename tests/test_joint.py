@@ -1,0 +1,189 @@
+"""Gradients reach exactly the parameters they should, the target networks none, resume goes on to the same bits."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from velap.config import Config, ModelConfig, TrainConfig
+from velap.data.episodes import FrameStore
+from velap.errors import CheckpointError, DatasetError
+from velap.models.latent import load_checkpoint
+from velap.runs import load_tensors
+from velap.training.joint import rollouts
+from velap.training.loop import MODEL, STATE, Trainer, train
+
+SMALL = ModelConfig(
+    frame_stack=2, latent_dim=4, encoder_filters=(4, 4), encoder_kernels=(4, 4), encoder_strides=(2, 2), encoder_dense=(8,),
+    dynamics_dense=(16,), generative_dense=(16,), noise_dim=2, policy_dense=(16,), critic_dense=(16,), bank_size=10,
+)
+QUICK = TrainConfig(joint_steps=6, batch_windows=3, window=5, latent_steps=6, latent_batch=8, latent_horizon=3,
+                    precision="float32", checkpoint_every=2, log_every=2, diagnose_every=4, holdout_episodes=1)
+
+
+def make_store(episodes: int = 12, length: int = 6) -> FrameStore:
+    rng = np.random.default_rng(0)
+    n = episodes * (length + 1)
+    rewards, terminated, truncated = np.zeros(n, np.float32), np.zeros(n, bool), np.zeros(n, bool)
+    ends = np.arange(length - 1, n, length + 1)
+    rewards[ends[:2]] = 1
+    terminated[ends[:2]] = True
+    truncated[ends[2:]] = True
+    return FrameStore(
+        frames=rng.integers(0, 255, (n, 16, 16, 3), dtype=np.uint8), actions=rng.uniform(-2, 2, (n, 3)).astype(np.float32),
+        rewards=rewards, terminated=terminated, truncated=truncated, episode_start=np.arange(episodes) * (length + 1),
+        episode_length=np.full(episodes, length), action_low=np.full(3, -2, np.float32), action_high=np.full(3, 2, np.float32),
+        dataset_id="test/noise-v0", content_hash="abc",
+    )
+
+
+def config(model: ModelConfig = SMALL, **changes) -> Config:
+    return Config("test", "default", model=model, train=dataclasses.replace(QUICK, **changes))
+
+
+def trainer(tmp_path: Path, norm: str = "layer", **changes) -> Trainer:
+    settings = config(dataclasses.replace(SMALL, norm=norm), **changes)
+    return Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
+
+
+def touched(module: torch.nn.Module) -> bool:
+    return any(p.grad is not None and p.grad.abs().sum() > 0 for p in module.parameters())
+
+
+@pytest.mark.parametrize("norm", ["layer", "batch"])
+def test_model_loss_reaches_encoder_dynamics_and_critics_only(tmp_path, norm):
+    run = trainer(tmp_path, norm)
+    run.learner.model_optimizer.step = lambda: None
+    run.learner._update_policies = lambda latents, batch: {}
+    run.update()
+    model = run.model
+    for part in (model.encoder, model.dynamics, model.local_critics, model.global_critic):
+        assert touched(part)
+    for part in (model.local_policy, model.global_policy, model.action_model, run.learner.local_target, run.learner.global_target):
+        assert not touched(part)
+
+
+@pytest.mark.parametrize("norm", ["layer", "batch"])
+def test_policy_step_reaches_policies_and_action_model_only(tmp_path, norm):
+    run = trainer(tmp_path, norm)
+    learner, model = run.learner, run.model
+    batch = run.sampler.sample(3, 5, True, run.generator)
+    before = {k: v.clone() for k, v in model.state_dict().items()}
+    learner._update_policies(model.encode(run.sampler.stacks(batch.rows)).detach(), batch)
+    changed = {k.split(".")[0] for k, v in model.state_dict().items() if not torch.equal(v, before[k]) and "running" not in k
+               and "num_batches" not in k}
+    assert changed == {"local_policy", "global_policy", "action_model"}
+    assert not touched(model.encoder) and not touched(model.local_critics) and not touched(model.global_critic)
+
+
+def test_targets_follow_slowly_and_have_no_gradient(tmp_path):
+    run = trainer(tmp_path, target_rate=0.5)
+    old = next(run.learner.local_target.parameters()).clone()
+    run.update()
+    new, online = next(run.learner.local_target.parameters()), next(run.model.local_critics.parameters())
+    torch.testing.assert_close(new, (old + online) / 2)
+    assert all(not p.requires_grad for p in run.learner.local_target.parameters())
+
+
+def test_evaluated_networks_keep_their_batch_statistics(tmp_path):
+    run = trainer(tmp_path, "batch")
+    learner, model = run.learner, run.model
+    batch = run.sampler.sample(3, 5, True, run.generator)
+    latents = model.encode(run.sampler.stacks(batch.rows)).detach()
+    policies = [b.clone() for b in model.local_policy.buffers()]
+    learner.value_loss(latents, batch)
+    assert all(torch.equal(a, b) for a, b in zip(policies, model.local_policy.buffers(), strict=True))
+    critics = [b.clone() for b in model.local_critics.buffers()]
+    learner.acting_loss(latents, batch)
+    assert all(torch.equal(a, b) for a, b in zip(critics, model.local_critics.buffers(), strict=True))
+
+
+def test_rollouts_chain_the_dynamics_along_the_data(tmp_path):
+    run = trainer(tmp_path)
+    batch = run.sampler.sample(3, 5, True, run.generator)
+    latents = torch.randn(len(batch.rows), 4)
+    predicted, truth, valid = rollouts(run.model, latents, batch, 2, True)
+    assert predicted.shape == (2, 12, 4)
+    # rollout 5 starts in window 1 (6 frames each) at step 1
+    first = run.model.step(latents[7], batch.actions[1, 1])
+    torch.testing.assert_close(predicted[0, 5], first)
+    torch.testing.assert_close(predicted[1, 5], run.model.step(first, batch.actions[1, 2]))
+    assert truth[:, 5].tolist() == [8, 9] and valid[:, 5].tolist() == batch.valid[1, 1:3].tolist()
+
+
+def test_latent_phase_leaves_the_encoder_alone(tmp_path):
+    run = trainer(tmp_path, joint_steps=0)
+    before = [p.clone() for p in run.model.encoder.parameters()]
+    run.update()
+    assert all(torch.equal(a, b) for a, b in zip(before, run.model.encoder.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("norm", ["layer", "batch"])
+@pytest.mark.parametrize("stop", [2, 6, 10])
+def test_resume_goes_on_to_the_same_bits(tmp_path, norm, stop):
+    straight = trainer(tmp_path / "a", norm)
+    broken = trainer(tmp_path / "b", norm)
+    for _ in range(12):
+        straight.update()
+    for _ in range(stop):
+        broken.update()
+    broken.save()
+    again = trainer(tmp_path / "b", norm)
+    again.resume()
+    for _ in range(12 - stop):
+        again.update()
+    expected = straight.model.state_dict()
+    assert all(torch.equal(v, expected[k]) for k, v in again.model.state_dict().items())
+    assert straight.finish("x").sha256  # the measured latents and the bank complete the model
+
+
+def test_train_writes_a_loadable_model_and_readable_metrics(tmp_path):
+    seen = []
+    result = train(config(), make_store(), tmp_path, device="cpu", on_progress=seen.append, command="velap train test")
+    model, loaded, metadata = load_checkpoint(result.checkpoint)
+    assert loaded == config() and metadata["command"] == "velap train test" and metadata["dataset_hash"] == "abc"
+    assert result.checkpoint.name == MODEL and model.step_distance > 0 and (model.bank_rows >= 0).all()
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [2, 4, 6, 8, 10, 12]
+    assert "rollout/error_3" in rows[1] and rows[-1]["phase"] == "latent"
+    assert [p.step for p in seen] == [2, 4, 6, 8, 10, 12]
+
+
+def test_foreign_and_existing_runs_are_refused(tmp_path):
+    train(config(), make_store(), tmp_path, device="cpu")
+    with pytest.raises(CheckpointError, match="--resume"):
+        train(config(), make_store(), tmp_path, device="cpu")
+    with pytest.raises(CheckpointError, match="another config"):
+        train(config(c0=0.3), make_store(), tmp_path, device="cpu", resume=True)
+    with pytest.raises(CheckpointError, match="another seed"):
+        train(config(), make_store(), tmp_path, device="cpu", resume=True, seed=1)
+
+
+def test_short_episodes_are_an_error(tmp_path):
+    with pytest.raises(DatasetError, match="longest episode has 2 steps"):
+        Trainer(config(), make_store(length=2), tmp_path, 0, torch.device("cpu"))
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "foreign"])
+def test_damaged_checkpoints_are_refused(tmp_path, damage):
+    train(config(), make_store(), tmp_path, device="cpu")
+    path = tmp_path / MODEL
+    raw = bytearray(path.read_bytes())
+    if damage == "truncate":
+        raw = raw[: len(raw) // 2]
+    elif damage == "flip":
+        raw[-20] ^= 4
+    else:
+        raw = bytearray((tmp_path / STATE).read_bytes())
+    path.write_bytes(bytes(raw))
+    with pytest.raises(CheckpointError):
+        load_checkpoint(path)
+
+
+def test_state_holds_no_pickle(tmp_path):
+    train(config(), make_store(), tmp_path, device="cpu")
+    tensors, metadata = load_tensors(tmp_path / STATE)
+    assert metadata["step"] == "12" and "generator" in tensors

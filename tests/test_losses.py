@@ -1,0 +1,112 @@
+"""Losses against hand-computed numbers (Eq. 2-5, 9, Table 4)."""
+
+import math
+
+import pytest
+import torch
+from torch import tensor
+
+from velap.training.losses import (
+    action_model_loss,
+    critic_loss,
+    infonce_loss,
+    policy_loss,
+    polyak,
+    reparameterise,
+    rollout_mse_loss,
+    td_target,
+    weighted_mean,
+)
+
+ONES = torch.ones(2)
+
+
+def test_weighted_mean_ignores_padding_and_averages_members():
+    weight = tensor([1.0, 1.0, 0.0])
+    assert weighted_mean(tensor([1.0, 3.0, 99.0]), weight).item() == 2.0
+    assert weighted_mean(tensor([[1.0, 3.0, 99.0], [2.0, 4.0, 99.0]]), weight).item() == 2.5
+
+
+def test_weighted_mean_of_padding_alone_is_zero():
+    assert weighted_mean(tensor([5.0]), tensor([0.0])).item() == 0.0
+
+
+def test_td_target_bootstraps_before_terminals_only():
+    target = td_target(tensor([0.0, 1.0]), tensor([1.0, 0.0]), tensor([0.5, 0.9]), 0.96)
+    torch.testing.assert_close(target, tensor([0.48, 1.0]))
+
+
+def test_td_target_carries_no_gradient():
+    q = tensor([0.5], requires_grad=True)
+    assert not td_target(tensor([0.0]), tensor([1.0]), q, 0.96).requires_grad
+
+
+def test_critic_loss_is_mean_over_members_of_squared_error():
+    loss, info = critic_loss(tensor([[0.5, 1.0], [0.0, 0.0]]), tensor([0.0, 1.0]), ONES)
+    # member 1: (0.25 + 0) / 2, member 2: (0 + 1) / 2
+    assert loss.item() == pytest.approx((0.125 + 0.5) / 2)
+    assert info["q"].item() == pytest.approx(0.375)
+
+
+def test_policy_loss_adds_value_and_weighted_imitation():
+    action = tensor([[1.0, 0.0], [0.0, 0.0]])
+    data = tensor([[0.0, 0.0], [0.0, 2.0]])
+    loss, info = policy_loss(tensor([0.3, 0.5]), action, data, 0.5, ONES)
+    assert info["imitation"].item() == pytest.approx((0.5 + 2.0) / 2)
+    assert loss.item() == pytest.approx(-0.4 + 0.5 * 1.25)
+
+
+def test_infonce_by_hand():
+    # one rollout of one step: the truth at distance 1, one negative at distance 2
+    predicted = tensor([[[0.0, 0.0]]])
+    candidates = tensor([[1.0, 0.0], [0.0, 2.0]])
+    loss, _ = infonce_loss(predicted, tensor([[0]]), candidates, tensor([[True]]), temperature=1.0)
+    assert loss.item() == pytest.approx(-math.log(math.exp(-1) / (math.exp(-1) + math.exp(-2))), rel=1e-5)
+    cold, _ = infonce_loss(predicted, tensor([[0]]), candidates, tensor([[True]]), temperature=0.5)
+    assert cold.item() == pytest.approx(-math.log(math.exp(-2) / (math.exp(-2) + math.exp(-4))), rel=1e-5)
+
+
+def test_infonce_averages_each_step_over_its_valid_rollouts():
+    predicted = torch.zeros(2, 2, 1)
+    candidates = tensor([[0.0], [1.0]])
+    positive = tensor([[0, 1], [1, 0]])
+    valid = tensor([[True, False], [True, True]])
+    near = math.log(1 + math.exp(-1))
+    far = 1 + near
+    loss, _ = infonce_loss(predicted, positive, candidates, valid, 1.0)
+    assert loss.item() == pytest.approx((near + (far + near) / 2) / 2, abs=2e-3)  # distances are floored at 1e-3
+
+
+def test_infonce_has_a_finite_gradient_on_a_perfect_prediction():
+    predicted = torch.zeros(1, 1, 3, requires_grad=True)
+    loss, _ = infonce_loss(predicted, tensor([[0]]), torch.zeros(2, 3), tensor([[True]]), 1.0)
+    loss.backward()
+    assert torch.isfinite(predicted.grad).all()
+
+
+def test_rollout_mse_is_in_units_of_scale_over_valid_steps():
+    predicted = tensor([[[1.0, 1.0]], [[5.0, 5.0]]])
+    actual = torch.zeros(2, 1, 2, requires_grad=True)
+    loss, _ = rollout_mse_loss(predicted, actual, tensor([[True], [False]]), tensor(4.0))
+    assert loss.item() == pytest.approx(0.5)
+    assert not loss.requires_grad
+
+
+def test_action_model_loss_by_hand():
+    decoded, action = tensor([[0.5, 0.0]]), tensor([[0.0, 1.0]])
+    mean, log_variance = tensor([[1.0]]), tensor([[math.log(2.0)]])
+    loss, info = action_model_loss(decoded, action, mean, log_variance, 0.01, torch.ones(1))
+    kl = 0.5 * (1 + 2 - 1 - math.log(2))
+    assert info["reconstruction"].item() == pytest.approx(1.25)
+    assert info["kl"].item() == pytest.approx(kl)
+    assert loss.item() == pytest.approx(1.25 + 0.01 * kl)
+
+
+def test_reparameterise_scales_by_the_standard_deviation():
+    assert reparameterise(tensor([1.0]), tensor([math.log(4.0)]), tensor([0.5])).item() == pytest.approx(2.0)
+
+
+def test_polyak_moves_by_its_rate():
+    target = [tensor([0.0])]
+    polyak(target, [tensor([2.0])], 0.25)
+    assert target[0].item() == 0.5
