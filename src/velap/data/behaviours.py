@@ -20,7 +20,7 @@ Behaviour = Callable[[gym.Env, Recipe, np.random.Generator], Policy]
 
 
 def random_walk(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Policy:
-    """a_0 uniform, then Gaussian steps of `recipe.action_noise` clipped to the bounds (App. C.1.1); scaled from [-1, 1] to the space."""
+    """a_0 uniform, then Gaussian steps of `recipe.action_noise` clipped to the bounds (App. C.1.1), scaled to the action space."""
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -65,12 +65,12 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
                    trajectory: int) -> dict[str, np.ndarray]:
     """One trajectory: rows of a frame store, and what is known of it.
 
-    Its random numbers depend on (seed, context, trajectory) alone. It ends at a reward, at the environment's own end, or after
-    `recipe.max_steps` as truncated.
+    Its random numbers depend on (seed, context, trajectory) alone. It ends at a reward, at the environment's own end, or as
+    truncated after `recipe.max_steps`.
 
     Returns:
-        frames uint8 [T+1, H, W, 3], actions float32 [T+1, A], rewards float32 [T+1], terminated and truncated bool [T+1], positions
-        float32 [T+1, P]; length, reset_seed, context, behaviour int64 [1].
+        frames uint8 [T+1, H, W, 3], actions float32 [T+1, A], rewards float32 [T+1], terminated and truncated bool [T+1],
+        positions float32 [T+1, P]; length, reset_seed, context, behaviour int64 [1].
     """
     reset_stream, policy_stream = np.random.SeedSequence(entropy=seed, spawn_key=(context, trajectory)).spawn(2)
     reset_seed = int(reset_stream.generate_state(1)[0])

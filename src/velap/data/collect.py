@@ -1,7 +1,7 @@
-"""Collect the dataset of a task (App. C, Table 10) in parallel: the same arrays for the same seed whatever the number of workers.
+"""Collect the dataset of a task (App. C, Table 10) in parallel: a seed fixes the arrays, whatever the number of workers.
 
-Finished trajectories lie as shards beside the dataset until all are there; then the dataset is built and renamed into place. A
-run that was killed goes on from its shards when the same command is given again.
+Finished trajectories lie as shards beside the dataset until all are there; then the dataset is built and renamed into place.
+A run that was killed goes on from its shards when the same command is given again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gymnasium.envs.registration import EnvSpec
 from velap import errors
 from velap.data import minari_io
 from velap.data.behaviours import mixture, reset_options
-from velap.data.episodes import FrameStore, make_store, refuse_existing, write_dataset
+from velap.data.episodes import Extras, FrameStore, make_store, write_dataset
 from velap.errors import DatasetError, StorageError, VelapError
 from velap.tasks import Task, get_task
 
@@ -106,8 +106,10 @@ class _Worker:
 
     def _death(self) -> VelapError:
         code = self.process.wait()
-        tail = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()][-1:] or ["it left no message"]
-        return DatasetError(f"a collecting process ended with code {code}: {tail[0]}. Expected it to finish its trajectories. Those that are "
+        tail = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()][-1:] or ["it left no "
+                                                                                                             "message"]
+        return DatasetError(f"a collecting process ended with code {code}: {lines[-1] if lines else 'it left no message'}. Expected it to finish its "
+                            "trajectories. Those that are "
                             "finished are kept: run the same command again, with fewer --workers if memory was short.")
 
     def stop(self) -> None:
@@ -179,7 +181,7 @@ def _run(workers: list[_Worker], pending: list[_Shard], done: int, total: int, p
 
 def _assemble(directory: Path, shards: list[_Shard], description: dict[str, Any], dataset_id: str,
               ) -> tuple[FrameStore, dict[str, np.ndarray]]:
-    """The store of all shards in order, and the arrays that a store does not hold. Frames are copied once, shard by shard."""
+    """The store of all shards in order, and the arrays that a store does not hold. Frames are copied once."""
     lengths = []
     for shard in shards:
         with np.load(directory / shard.name, allow_pickle=False) as file:
@@ -196,8 +198,8 @@ def _assemble(directory: Path, shards: list[_Shard], description: dict[str, Any]
             for key, part in parts.items():
                 part.append(file[key])
     arrays = {key: np.concatenate(part) for key, part in parts.items()}
-    store = make_store(frames, arrays["actions"], arrays["rewards"], arrays["terminated"], arrays["truncated"], arrays["length"],
-                       np.asarray(description["action_low"]), np.asarray(description["action_high"]), dataset_id)
+    store = make_store(frames, *(arrays[key] for key in (*_ROW_ARRAYS[1:5], "length")), np.asarray(description["action_low"]),
+                       np.asarray(description["action_high"]), dataset_id)
     return store, arrays
 
 
@@ -225,26 +227,27 @@ def _result(task: Task, store: FrameStore, path: Path, resumed: int, began: floa
                          int(store.rewards.sum()), resumed, time.monotonic() - began, tuple(notes))
 
 
-def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, Any], starts: list[list[float]], dataset_id: str,
-           command: str) -> tuple[FrameStore, Path]:
+def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, Any], starts: list[list[float]],
+           dataset_id: str, command: str) -> tuple[FrameStore, Path]:
     store, arrays = _assemble(work / "shards", _shards(task), description, dataset_id)
     names = sorted(plan["shares"])
     options = [{**reset_options(task.recipe, int(context)), "behaviour": names[int(number)]}
                for context, number in zip(arrays["context"], arrays["behaviour"], strict=True)]
     spec = EnvSpec.from_json(description["env_spec"]) if description["env_spec"] else None
-    path = write_dataset(
-        store, positions=arrays["positions"] if arrays["positions"].shape[1] else None, seeds=arrays["reset_seed"].tolist(),
-        options=options, env_spec=spec, overwrite=True,
+    extras = Extras(
+        positions=arrays["positions"] if arrays["positions"].shape[1] else None,
+        seeds=arrays["reset_seed"].tolist(),
+        options=options, env_spec=spec,
         metadata={"algorithm_name": ", ".join(names), "author": {"velap"},
                   "description": f"{task.name}: {task.recipe.contexts} × {task.recipe.trajectories} trajectories of at most "
                                  f"{task.recipe.max_steps} steps, seed {plan['seed']} (Table 10 of VELAP, CoRL 2023)."},
         provenance={"plan": plan, "command": command, "test_starts": starts, "extent": description["extent"]},
     )
-    return store, path
+    return store, write_dataset(store, extras, overwrite=True)
 
 
-def collect(task: str | Task, seed: int = 0, workers: int | None = None, dataset_id: str | None = None, overwrite: bool = False,
-            resume: bool = True, progress: Progress | None = None, command: str | None = None) -> CollectResult:
+def collect(task: str | Task, seed: int = 0, workers: int | None = None, dataset_id: str | None = None,
+            overwrite: bool = False, resume: bool = True, progress: Progress | None = None, command: str | None = None) -> CollectResult:
     """Collect the dataset of a task and write it as a Minari dataset.
 
     Args:
@@ -265,7 +268,7 @@ def collect(task: str | Task, seed: int = 0, workers: int | None = None, dataset
     dataset_id = dataset_id or task.dataset_id
     count = max(1, min(workers or len(os.sched_getaffinity(0)), len(_shards(task))))
     target, work = minari_io.dataset_path(dataset_id), minari_io.partial_path(dataset_id)
-    refuse_existing(dataset_id, overwrite)
+    minari_io.refuse_existing(dataset_id, overwrite)
     try:
         minari_io.make_namespace(dataset_id)
         with minari_io.exclusive(work, dataset_id):
@@ -291,7 +294,8 @@ def _collect(task: Task, seed: int, count: int, dataset_id: str, work: Path, res
         descriptions = [worker.answer() for worker in running]
         description = descriptions[0]
         if any(other["fingerprint"] != description["fingerprint"] for other in descriptions):
-            raise DatasetError(f"two processes got different frames from {task.env_id} for one seed; expected equal ones. The environment or "
+            raise DatasetError(f"two processes got different frames from {task.env_id} for one seed; expected equal ones. "
+                               "The environment or "
                                "the renderer is not deterministic: use one renderer for all (MUJOCO_GL=egl or osmesa).")
         plan = {"task": task.name, "env_id": task.env_id, "seed": seed, "recipe": recipe, "shares": shares,
                 "fingerprint": description["fingerprint"]}

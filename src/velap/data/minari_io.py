@@ -1,7 +1,7 @@
 """Where Minari datasets lie, how one is put in place whole or not at all, and how a damaged one is noticed.
 
-Minari 0.5.4: a dataset is a directory `<root>/<id>/data` with `metadata.json` and `main_data.hdf5`; directories whose name begins
-with a dot are not listed, so unfinished work lives in `<root>/<namespace>/.<name>.partial`.
+Minari 0.5.4: a dataset is a directory `<root>/<id>/data` with `metadata.json` and `main_data.hdf5`; directories whose name
+begins with a dot are not listed, so that unfinished work lives in `<root>/<namespace>/.<name>.partial`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from minari.storage.local import list_local_datasets
 from velap.errors import DatasetError, StorageError
 
 UNREADABLE = (
-    OSError, KeyError, ValueError, RuntimeError, TypeError, AssertionError, IndexError, AttributeError, EOFError, OverflowError,
-    MemoryError, struct.error, gym.error.Error,
+    OSError, KeyError, ValueError, RuntimeError, TypeError, AssertionError, IndexError, AttributeError, EOFError,
+    OverflowError, MemoryError, struct.error, gym.error.Error,
 )
 """What Minari, h5py and Pillow raise on files that are damaged or were never theirs."""
 
@@ -42,10 +42,10 @@ VELAP_KEY = "velap"
 def check_dataset_id(dataset_id: str) -> None:
     """Raise DatasetError unless Minari takes `dataset_id` as `(namespace/)name-v0`."""
     match = DATASET_ID_RE.fullmatch(dataset_id)
-    namespace = match.group("namespace") if match else None
-    if match is None or match.group("version") is None or (namespace or "").startswith("/"):
-        raise DatasetError(f"{dataset_id!r} is not a Minari dataset id; expected (namespace/)name-v0, letters, digits, - and _ "
-                           "only, a version at the end, for example velap/SpiralMaze-v0.")
+    if match is None or match.group("version") is None:
+        raise DatasetError(f"{dataset_id!r} is not a Minari dataset id; expected (namespace/)name-v0: letters, digits, - "
+                           "and _, "
+                           "and a version at the end, for example velap/SpiralMaze-v0.")
 
 
 def dataset_path(dataset_id: str) -> Path:
@@ -63,16 +63,18 @@ def partial_path(dataset_id: str) -> Path:
     return target.parent / f".{target.name}.partial"
 
 
-def storage_error(error: OSError, what: str) -> StorageError:
+def storage_error(error: Exception, what: str) -> StorageError:
     """A StorageError that says what could not be written, why, and what to do."""
-    reason = str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT) or "errno = 28" in reason or "No space left" in reason:
-        way_out = "The disk is full: free some space, or point MINARI_DATASETS_PATH to another disk, and run the same command again."
-    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        way_out = "There is no permission to write: point MINARI_DATASETS_PATH to a directory of yours."
+    reason, number = " ".join(str(error).split()), getattr(error, "errno", None)
+    if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "errno = 28" in reason or "No space left" in reason:
+        way_out = "Free some space, or point MINARI_DATASETS_PATH to another disk"
+    elif number in (errno.EACCES, errno.EPERM, errno.EROFS):
+        way_out = "Point MINARI_DATASETS_PATH to a directory that you may write to"
     else:
-        way_out = "Make the place writable, or point MINARI_DATASETS_PATH to another one, and run the same command again."
-    return StorageError(f"could not write {what}: {reason}. Nothing half-written was put in place. {way_out}")
+        way_out = "Make the place writable, or point MINARI_DATASETS_PATH to another one"
+    return StorageError(f"could not write {what}: {reason}. Expected a disk with room that may be written to; nothing "
+                        "half-written "
+                        f"was put in place. {way_out}, and run the same command again.")
 
 
 def file_sha256(path: Path) -> str:
@@ -81,14 +83,12 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def fsync_tree(directory: Path) -> None:
-    """Force every file of `directory`, and the directories themselves, to the disk."""
-    for path in [*directory.rglob("*"), directory]:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_atomic(path: Path, content: bytes) -> None:
@@ -112,24 +112,36 @@ def make_namespace(dataset_id: str) -> None:
             create_namespace(namespace)
 
 
+def _old(target: Path) -> Path:
+    return target.parent / f".{target.name}.old"
+
+
 def install(built: Path, target: Path) -> None:
-    """Rename the finished dataset `built` to `target`; a dataset that was there is deleted after the new one is in place."""
-    old = target.parent / f".{target.name}.old"
-    shutil.rmtree(old, ignore_errors=True)
+    """Rename the finished dataset `built` to `target`; a dataset that was there is deleted once the new one is in place."""
+    for path in [*built.rglob("*"), built]:
+        _fsync(path)
+    shutil.rmtree(_old(target), ignore_errors=True)
     if target.exists():
-        target.rename(old)
+        target.rename(_old(target))
     built.rename(target)
-    fsync_directory(target.parent)
-    shutil.rmtree(old, ignore_errors=True)
+    _fsync(target.parent)
+    shutil.rmtree(_old(target), ignore_errors=True)
 
 
-def fsync_directory(directory: Path) -> None:
-    """Force the names in `directory` to the disk."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def exists(dataset_id: str) -> bool:
+    """Is the dataset there? One whose replacement was interrupted between the two renames is put back."""
+    target = dataset_path(dataset_id)
+    if not target.exists() and _old(target).exists():
+        _old(target).rename(target)
+    return target.exists()
+
+
+def refuse_existing(dataset_id: str, overwrite: bool) -> None:
+    """Raise DatasetError when the dataset is there and may not be replaced."""
+    if exists(dataset_id) and not overwrite:
+        raise DatasetError(f"the dataset {dataset_id} exists already in {dataset_path(dataset_id)}; expected a free id. "
+                           "Give "
+                           "--overwrite to replace it, or another --dataset-id to keep both.")
 
 
 @contextlib.contextmanager
@@ -140,7 +152,8 @@ def exclusive(directory: Path, dataset_id: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise StorageError(f"another process is writing {dataset_id} (it holds {directory / 'lock'}); expected to be alone. "
+            raise StorageError(f"another process is writing {dataset_id} (it holds {directory / 'lock'}); expected to be "
+                               "alone. "
                                "Wait for it or stop it, then run the same command again.") from error
         yield
 
@@ -148,7 +161,7 @@ def exclusive(directory: Path, dataset_id: str) -> Iterator[None]:
 def read_metadata(dataset_id: str) -> dict[str, Any]:
     """`metadata.json` of a local dataset; DatasetError when there is none or it is damaged."""
     path = dataset_path(dataset_id) / "data" / METADATA_FILE
-    if not path.parent.is_dir():
+    if not exists(dataset_id) or not path.parent.is_dir():
         raise DatasetError(_missing(dataset_id))
     try:
         metadata = json.loads(path.read_bytes())
@@ -170,7 +183,7 @@ def open_dataset(dataset_id: str) -> MinariDataset:
         except OSError as error:
             raise damaged(dataset_id, f"{path / DATA_FILE} cannot be read ({error})") from error
         if got != expected:
-            raise damaged(dataset_id, f"{path / DATA_FILE} has SHA-256 {got[:12]}…, expected {str(expected)[:12]}…")
+            raise damaged(dataset_id, f"{path / DATA_FILE} has SHA-256 {got[:12]}…, not {str(expected)[:12]}…")
     try:
         return MinariDataset(path)
     except UNREADABLE as error:
@@ -185,9 +198,11 @@ def velap_metadata(metadata: dict[str, Any]) -> dict[str, Any]:
 
 def damaged(dataset_id: str, detail: str) -> DatasetError:
     """DatasetError for files that are truncated, bit-flipped or changed after they were written."""
-    return DatasetError(f"the dataset {dataset_id} is damaged or was changed after it was written: {' '.join(detail.split())}. Expected "
-                        "the files as they were written. Restore them from a copy, or write the dataset again (for a task of "
-                        "velap: velap collect TASK --overwrite).")
+    return DatasetError(f"the dataset {dataset_id} is damaged or was changed after it was written: "
+                        f"{' '.join(detail.split())}. "
+                        "Expected the files as they were written. Restore them from a copy, or write the dataset again "
+                        "(for a "
+                        "task of velap: velap collect TASK --overwrite).")
 
 
 def _missing(dataset_id: str) -> str:
@@ -196,6 +211,7 @@ def _missing(dataset_id: str) -> str:
     except UNREADABLE:
         known = []
     near = difflib.get_close_matches(dataset_id, known, n=3, cutoff=0.5) or known[:5]
-    here = f"here are {', '.join(near)}" if near else "there is none here yet"
-    return (f"there is no Minari dataset {dataset_id!r} under {get_dataset_path()}; {here}. Make it with velap collect TASK, fetch it with "
-            "minari download, or set MINARI_DATASETS_PATH to where it lies.")
+    here = f"there are {', '.join(near)}" if near else "there is none yet"
+    return (f"no Minari dataset {dataset_id!r} under {get_dataset_path()}; expected a local dataset, {here}. Make it with "
+            "velap "
+            "collect TASK, fetch it with minari download, or set MINARI_DATASETS_PATH to where it lies.")

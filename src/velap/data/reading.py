@@ -1,6 +1,6 @@
-"""What a stranger's episodes must look like, and how they become rows of a frame store: each check says the way out.
+"""What a stranger's episodes must look like, and how they become rows of a frame store; each error says the way out.
 
-Letters: T transitions of one episode (it has T + 1 frames), A action entries, H×W image [px].
+Letters: F frames, T transitions of one episode (it has T + 1 frames), A action entries, H×W image [px].
 """
 
 from __future__ import annotations
@@ -12,145 +12,85 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from PIL import Image
+from minari.dataset.minari_dataset import MinariDataset
 
+from velap.data import minari_io
+from velap.data.images import ImageLayout, to_rgb
 from velap.errors import DatasetError
-
-IMAGE_SIZE = 64
-"""Side of the images that the networks read [px], Table 2."""
-MIN_SIDE = 8
-"""Boxes with a shorter side are vectors, not images [px]. ours."""
 
 
 @dataclass(frozen=True)
-class ImageLayout:
-    """Where the image lies in an observation and how it is laid out."""
+class Rows:
+    """Rows of all episodes. `frames` is by far the largest array: it is filled once and never copied."""
 
-    key: tuple[str, ...]
-    """Path of keys into nested Dict observations, empty for a plain Box."""
-    shape: tuple[int, ...]
-    """Shape of one image as stored."""
-    channel_first: bool
+    frames: np.ndarray
+    """uint8 [F, H, W, 3]."""
+    actions: np.ndarray
+    """float32 [F, A]."""
+    rewards: np.ndarray
+    """float64 [F]."""
+    terminated: np.ndarray
+    """bool [F]."""
+    truncated: np.ndarray
+    """bool [F]."""
+    length: np.ndarray
+    """int64 [E] transitions of each episode."""
 
-    @property
-    def side(self) -> int:
-        """Side of the square image [px]."""
-        return self.shape[-1] if self.channel_first else self.shape[0]
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """Those with one entry a frame, frames first."""
+        return self.frames, self.actions, self.rewards, self.terminated, self.truncated
 
-
-def _boxes(space: gym.Space, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], gym.Space]]:
-    if isinstance(space, gym.spaces.Dict):
-        for key, inner in space.spaces.items():
-            yield from _boxes(inner, (*path, key))
-    else:
-        yield path, space
-
-
-def _layout(path: tuple[str, ...], space: gym.Space) -> ImageLayout | None:
-    """The layout of an image-like Box of any number type, None for everything else."""
-    shape = space.shape if isinstance(space, gym.spaces.Box) else None
-    if shape is None or len(shape) not in (2, 3):
-        return None
-    channel_first = len(shape) == 3 and shape[0] in (1, 3) and shape[2] not in (1, 3)
-    sides = shape[1:] if channel_first else shape[:2]
-    return ImageLayout(path, shape, channel_first) if min(sides) >= MIN_SIDE else None
+    def end(self) -> np.ndarray:
+        """int64 [E] last row of each episode."""
+        return np.cumsum(self.length + 1) - 1
 
 
-def find_image(space: gym.Space, image_key: str | None, dataset_id: str) -> ImageLayout:
-    """The image of an observation space: the one named (`a/b` for nested Dicts), or the only one there is."""
-    boxes = dict(_boxes(space))
-    names = ["/".join(path) for path in boxes if path]
-    listing = "; ".join(f"{'/'.join(path) or 'observation'}: {box}" for path, box in boxes.items())
-    if image_key is not None and names:
-        path = tuple(image_key.split("/"))
-        if path not in boxes:
-            raise DatasetError(f"{dataset_id} has no observation key {image_key!r}; expected one of {', '.join(names)}. Name it with --image-key.")
-        boxes = {path: boxes[path]}
-    found = [layout for path, box in boxes.items() if (layout := _layout(path, box)) is not None]
-    exact = [layout for layout in found if boxes[layout.key].dtype == np.uint8]
-    found = exact if len(exact) == 1 else found
-    if not found:
-        raise DatasetError(f"{dataset_id} has no image observation ({_short(listing)}); expected uint8 images [H, W, 3]. velap learns from "
-                           "pixels: render the frames into the dataset first.")
-    if len(found) > 1:
-        several = ", ".join("/".join(layout.key) for layout in found)
-        raise DatasetError(f"{dataset_id} has several image observations ({several}); expected one. Name the one to use with --image-key.")
-    _check_layout(found[0], boxes[found[0].key], dataset_id)
-    return found[0]
-
-
-def _short(text: str, limit: int = 300) -> str:
-    return text if len(text) <= limit else text[:limit] + "…"
-
-
-def _check_layout(layout: ImageLayout, box: gym.Space, dataset_id: str) -> None:
-    name = "/".join(layout.key) or "the observation"
-    if box.dtype != np.uint8:
-        raise DatasetError(f"{dataset_id}: {name} is {box.dtype}; expected uint8 in 0 to 255. Store it as np.uint8 (for floats in 0 to 1: "
-                           "np.round(255 * frame).astype(np.uint8)) and write the dataset again.")
-    shape = layout.shape
-    channels = 1 if len(shape) == 2 else shape[0] if layout.channel_first else shape[2]
-    sides = shape[1:] if layout.channel_first else shape[:2]
-    if channels not in (1, 3):
-        hint = "velap stacks frames itself: store the newest frame alone" if channels % 3 == 0 else "drop the channels beyond red, green, blue"
-        raise DatasetError(f"{dataset_id}: {name} has shape {shape} with {channels} channels; expected 3 or 1; {hint}.")
-    if sides[0] != sides[1]:
-        raise DatasetError(f"{dataset_id}: {name} has shape {shape}; expected square images. Crop or pad them to a square when the "
-                           "dataset is written; velap resizes squares by itself.")
-
-
-def to_rgb(raw: np.ndarray, layout: ImageLayout, size: int | None) -> np.ndarray:
-    """Stored images uint8 [T+1, *layout.shape] → uint8 [T+1, size, size, 3]; grey is repeated, other sizes are box-filtered."""
-    if layout.channel_first:
-        raw = np.moveaxis(raw, 1, -1)
-    elif raw.ndim == 3:
-        raw = raw[..., None]
-    if raw.shape[-1] == 1:
-        raw = np.broadcast_to(raw, (*raw.shape[:3], 3))
-    if size is None or raw.shape[1] == size:
-        return raw
-    return np.stack([np.asarray(Image.fromarray(np.ascontiguousarray(frame)).resize((size, size), Image.Resampling.BOX))
-                     for frame in raw])
+def notice(text: str) -> None:
+    """Tell the user about a harmless change that is made to the data while reading."""
+    warnings.warn(text, UserWarning, stacklevel=4)
 
 
 def action_bounds(space: gym.Space, dataset_id: str) -> tuple[np.ndarray, np.ndarray]:
     """float32 [A] lower and upper bounds, infinite where the dataset names none."""
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
-        raise DatasetError(f"{dataset_id} has actions {_short(str(space))}; expected a Box of floats with one axis. velap's policies are "
-                           "continuous: discrete or nested actions need another method.")
+        raise DatasetError(f"{dataset_id} has the action space {str(space)[:200]}; expected a Box of floats with one axis. "
+                           "The "
+                           "policies here are continuous: discrete or nested actions need another method.")
     low, high = space.low.astype(np.float32), space.high.astype(np.float32)
     if not np.all(low < high):
-        raise DatasetError(f"{dataset_id} has action bounds {low.tolist()} to {high.tolist()}; expected low < high in every entry. "
-                           "Leave constant entries out of the action.")
+        raise DatasetError(f"{dataset_id} has action bounds {low.tolist()} to {high.tolist()}; expected low < high in every "
+                           "entry. Leave constant entries out of the action and write the dataset again.")
     return low, high
 
 
 def reward_levels(rewards: np.ndarray, dataset_id: str) -> tuple[float, float]:
-    """The two values of a sparse reward, (ordinary, success); DatasetError for any other kind of reward.
-
-    Args:
-        rewards: float [all transitions].
-    """
+    """The two values (ordinary, success) of a sparse reward float [all transitions]; DatasetError for any other kind."""
     levels = np.unique(rewards)
-    if levels.size == 0 or levels[-1] <= 0:
-        shown = ", ".join(f"{level:g}" for level in levels[-3:]) or "none"
-        raise DatasetError(f"{dataset_id} has no positive reward (values: {shown}); expected 1 on the transitions that succeed. "
-                           "velap learns from rare successes: record some, or label them (write reward 1 where the task was solved, else 0).")
+    if levels[-1] <= 0:
+        shown = ", ".join(f"{level:g}" for level in levels[-3:])
+        raise DatasetError(f"the rewards of {dataset_id} are never positive (values: {shown}); expected 1 on the "
+                           "transitions that "
+                           "solve the task and 0 elsewhere. Record some successes, or label them, and write the dataset "
+                           "again.")
     if levels.size == 1:
-        raise DatasetError(f"{dataset_id} has reward {levels[0]:g} on every transition; expected 0 on most and 1 on the transitions that "
-                           "succeed. Write reward 0 where the task was not solved.")
+        raise DatasetError(f"every reward of {dataset_id} is {levels[0]:g}; expected 1 on the transitions that solve the "
+                           "task and "
+                           "0 elsewhere. Write reward 0 where the task was not solved.")
     if levels.size > 2:
-        raise DatasetError(f"{dataset_id} has {levels.size} different rewards, from {levels[0]:g} to {levels[-1]:g}; expected a sparse one with "
-                           "two values. Binarise it when the dataset is written: reward = float(success), for example "
-                           f"float(reward >= {levels[-1]:g}).")
+        raise DatasetError(f"{dataset_id} has {levels.size} different rewards, from {levels[0]:g} to {levels[-1]:g}; "
+                           "expected a "
+                           "sparse reward of two values. Binarise it and write the dataset again: reward = float(success), "
+                           "for "
+                           f"example float(reward >= {levels[-1]:g}).")
     return float(levels[0]), float(levels[1])
 
 
-def _field(episode: dict[str, Any], name: str, where: str, length: int | None = None) -> np.ndarray:
+def _vector(episode: dict[str, Any], name: str, where: str, length: int | None = None) -> np.ndarray:
     values = np.asarray(episode[name])
-    if values.ndim != 1 or (length is not None and len(values) != length):
-        raise DatasetError(f"{where}: {name} have shape {values.shape}; expected ({length if length is not None else 'T'},), one a "
-                           "transition. Write the episode again with one more observation than transitions.")
+    if values.ndim != 1 or values.dtype.kind not in "fiub" or (length is not None and len(values) != length):
+        expected = "one number a transition" if length is None else f"{length} of them, as many as rewards"
+        raise DatasetError(f"{where}: {name} are {values.dtype} of shape {values.shape}; expected {expected}. "
+                           "Write that episode again.")
     return values
 
 
@@ -158,56 +98,143 @@ def _require_finite(values: np.ndarray, name: str, where: str) -> None:
     finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not finite.all():
         step = int(np.argmin(finite))
-        raise DatasetError(f"{where}: {name} at step {step} is {np.asarray(values[step]).tolist()}; expected finite numbers. Drop that episode "
-                           "or repair the value, and write the dataset again.")
+        raise DatasetError(f"{where}: the {name} of step {step} is {values[step].tolist()}; expected finite numbers. "
+                           "Repair the "
+                           "value or drop that episode, and write the dataset again.")
 
 
-def raw_rewards(episode: dict[str, Any], where: str) -> np.ndarray:
-    """float64 [T] rewards of one Minari episode, finite."""
-    rewards = _field(episode, "rewards", where)
-    if rewards.dtype.kind not in "fiub":
-        raise DatasetError(f"{where}: rewards are {rewards.dtype}; expected numbers. Write reward 1.0 for success, else 0.0.")
-    rewards = rewards.astype(np.float64)
-    _require_finite(rewards, "reward", where)
-    return rewards
-
-
-def check_episode(episode: dict[str, Any], layout: ImageLayout, action_shape: tuple[int, ...], where: str) -> dict[str, np.ndarray]:
-    """The arrays of one Minari episode with agreeing shapes and finite values: frames, actions, rewards and both flags."""
-    rewards = raw_rewards(episode, where)
+def check_episode(episode: dict[str, Any], layout: ImageLayout, action_shape: tuple[int, ...],
+                  where: str) -> dict[str, np.ndarray]:
+    """The arrays of one Minari episode, shapes agreeing and values finite: images, actions, rewards and both flags."""
+    rewards = _vector(episode, "rewards", where).astype(np.float64)
     steps = len(rewards)
     if steps == 0:
         raise DatasetError(f"{where} has no transition; expected at least one. Leave empty episodes out of the dataset.")
-    frames = episode["observations"]
+    _require_finite(rewards, "reward", where)
+    images = episode["observations"]
     for key in layout.key:
-        frames = frames[key]
-    frames = np.asarray(frames)
-    if frames.shape != (steps + 1, *layout.shape) or frames.dtype != np.uint8:
-        raise DatasetError(f"{where}: the images are {frames.dtype} {frames.shape}; expected uint8 {(steps + 1, *layout.shape)}: one more than "
-                           "the rewards, of the shape that the dataset states. Write the episode again, last observation included.")
+        images = images[key]
+    images = np.asarray(images)
+    if images.shape != (steps + 1, *layout.shape) or images.dtype != np.uint8:
+        raise DatasetError(f"{where}: the images are {images.dtype} of shape {images.shape}; expected uint8 of shape "
+                           f"{(steps + 1, *layout.shape)}, one more than the {steps} rewards. Write that episode again, "
+                           "its last "
+                           "observation included.")
     actions = np.asarray(episode["actions"])
     if actions.shape != (steps, *action_shape):
-        raise DatasetError(f"{where}: the actions have shape {actions.shape}; expected {(steps, *action_shape)}, one a transition. "
-                           "Write the episode again.")
+        raise DatasetError(f"{where}: the actions have shape {actions.shape}; expected {(steps, *action_shape)}, one a "
+                           "transition. Write that episode again.")
     _require_finite(actions, "action", where)
     return {
-        "frames": frames,
+        "frames": images,
         "actions": actions.astype(np.float32),
         "rewards": rewards,
-        "terminated": _field(episode, "terminations", where, steps).astype(bool),
-        "truncated": _field(episode, "truncations", where, steps).astype(bool),
+        "terminated": _vector(episode, "terminations", where, steps).astype(bool),
+        "truncated": _vector(episode, "truncations", where, steps).astype(bool),
     }
 
 
-def check_flags(terminated: np.ndarray, truncated: np.ndarray, where: str) -> None:
-    """Raise DatasetError when a flag stands before the last transition. Both bool [T]."""
-    early = (terminated | truncated)[:-1]
-    if early.any():
-        step, kind = int(np.argmax(early)), "termination" if terminated[np.argmax(early)] else "truncation"
-        raise DatasetError(f"{where}: a {kind} stands at step {step}, but the episode goes on to step {len(terminated) - 1}; expected flags at "
-                           "the last transition only. Split the episode there and write the dataset again.")
+def episodes(dataset: MinariDataset) -> Iterator[dict[str, Any]]:
+    """Raw Minari episodes; whatever a damaged file makes the readers raise becomes a DatasetError."""
+    stored = iter(dataset.storage.get_episodes(dataset.episode_indices))
+    while True:
+        try:
+            episode = next(stored)
+        except StopIteration:
+            return
+        except minari_io.UNREADABLE as error:
+            raise minari_io.damaged(dataset.id, f"an episode cannot be read ({type(error).__name__}: {error})") from error
+        yield episode
 
 
-def notice(text: str) -> None:
-    """Tell the user about a harmless change that was made to the data while reading."""
-    warnings.warn(text, UserWarning, stacklevel=3)
+def read_rows(dataset: MinariDataset, layout: ImageLayout, size: int | None) -> Rows:
+    """All episodes in order, rewards as stored; arrays are made once from the counts in the dataset's metadata."""
+    capacity = dataset.total_steps + dataset.total_episodes
+    side, action_shape = layout.sides[0] if size is None else size, dataset.action_space.shape
+    if side != layout.sides[0]:
+        notice(f"{dataset.id}: images of {layout.sides[0]}×{layout.sides[1]} are resized to {side}×{side}.")
+    rows = Rows(np.empty((capacity, side, side, 3), np.uint8), np.zeros((capacity, *action_shape), np.float32),
+                np.zeros(capacity, np.float64), np.zeros(capacity, bool), np.zeros(capacity, bool), np.zeros(0, np.int64))
+    lengths, start = [], 0
+    for number, raw in enumerate(episodes(dataset)):
+        episode = check_episode(raw, layout, action_shape, f"{dataset.id}, episode {number}")
+        steps = len(episode["rewards"])
+        if start + steps + 1 > capacity:
+            raise minari_io.damaged(dataset.id, f"its metadata count {dataset.total_steps} transitions, its episodes hold "
+                                                "more")
+        rows.frames[start : start + steps + 1] = to_rgb(episode["frames"], layout, side)
+        for name in ("actions", "rewards", "terminated", "truncated"):
+            getattr(rows, name)[start : start + steps] = episode[name]
+        lengths.append(steps)
+        start += steps + 1
+    return Rows(*(array[:start] for array in rows.arrays()), np.asarray(lengths, np.int64))
+
+
+def binarise(rows: Rows, dataset_id: str) -> Rows:
+    """Rewards in {0, 1}; each episode ends at its first success, rows are moved down in place."""
+    transition = np.ones(len(rows.rewards), bool)
+    transition[rows.end()] = False
+    ordinary, level = reward_levels(rows.rewards[transition], dataset_id)
+    if (ordinary, level) != (0.0, 1.0):
+        notice(f"{dataset_id}: reward {level:g} is read as success (1), {ordinary:g} as 0.")
+    rows.rewards[:] = transition & (rows.rewards == level)
+    lengths, source, target = rows.length.copy(), 0, 0
+    for episode, steps in enumerate(rows.length):
+        hits = np.flatnonzero(rows.rewards[source : source + steps])
+        kept = int(hits[0]) + 1 if len(hits) else int(steps)
+        for array in rows.arrays():
+            if target != source:
+                array[target : target + kept + 1] = array[source : source + kept + 1]
+        last = target + kept
+        for array in rows.arrays()[1:]:
+            array[last] = 0
+        if len(hits):
+            rows.terminated[last - 1], rows.truncated[last - 1] = True, False
+        lengths[episode], source, target = kept, source + steps + 1, last + 1
+    cut = int((lengths < rows.length).sum())
+    if cut:
+        notice(f"{dataset_id}: {cut} episodes go on after their first success; what follows it is left out.")
+    return Rows(*(array[:target] for array in rows.arrays()), lengths)
+
+
+def check_ends(rows: Rows, dataset_id: str) -> None:
+    """DatasetError when a flag stands before an episode's last transition; episodes without a flag become truncated."""
+    ends = rows.end()
+    flags = rows.terminated | rows.truncated
+    unfinished = ~flags[ends - 1]
+    flags[ends - 1] = False
+    if flags.any():
+        row = int(np.argmax(flags))
+        episode = int(np.searchsorted(ends, row))
+        step = row - int(ends[episode] - rows.length[episode])
+        kind = "termination" if rows.terminated[row] else "truncation"
+        raise DatasetError(f"{dataset_id}, episode {episode}: a {kind} stands at step {step}, but the episode goes on to "
+                           "step "
+                           f"{rows.length[episode] - 1}; expected flags at the last step only. Split the episode there and "
+                           "write "
+                           "the dataset again.")
+    if unfinished.any():
+        notice(f"{dataset_id}: {unfinished.sum()} episodes end without a flag; they count as truncated.")
+        rows.truncated[ends[unfinished] - 1] = True
+
+
+def bound_actions(rows: Rows, low: np.ndarray, high: np.ndarray, dataset_id: str) -> tuple[np.ndarray, np.ndarray]:
+    """Finite bounds float32 [A]; actions beyond the stated ones are clipped in place, as environments do."""
+    taken = np.ones(len(rows.actions), bool)
+    taken[rows.end()] = False
+    actions = rows.actions[taken]
+    outside = int(((actions < low) | (actions > high)).any(axis=1).sum())
+    if outside:
+        notice(f"{dataset_id}: {outside} of {len(actions)} actions lie outside the action space; they are clipped to it.")
+        rows.actions[taken] = np.clip(actions, low, high)
+    if np.isfinite(low).all() and np.isfinite(high).all():
+        return low, high
+    low = np.where(np.isfinite(low), low, actions.min(axis=0))
+    high = np.where(np.isfinite(high), high, actions.max(axis=0))
+    if not np.all(low < high):
+        raise DatasetError(f"{dataset_id} has an unbounded action entry that never varies ({low.tolist()} to "
+                           f"{high.tolist()}); "
+                           "expected low < high. State the bounds of the action space, or leave that entry out.")
+    notice(f"{dataset_id}: the action space is unbounded; its bounds are taken from the data, {low.tolist()} to "
+           f"{high.tolist()}.")
+    return low, high

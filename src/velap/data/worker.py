@@ -1,7 +1,7 @@
 """A collecting process: reads jobs as JSON lines, answers each with a JSON line, leaves finished trajectories as shards.
 
-It is a plain child process, not one of `multiprocessing`: scripts need no main guard, and when the parent dies, however it dies,
-the pipe closes and the worker ends.
+It is a plain child process, not one of `multiprocessing`: scripts need no main guard, and when the parent dies, however it
+dies, the pipe closes and the worker ends.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, TextIO
 import gymnasium as gym
 import numpy as np
 
-from velap.data.behaviours import position_of, reset_options, run_trajectory
+from velap.data.behaviours import position_of, run_trajectory
 from velap.data.minari_io import write_atomic
 from velap.errors import VelapError
 from velap.tasks import Recipe
@@ -67,7 +67,7 @@ def collect_shard(env: gym.Env, job: Job, name: str, context: int, first: int, c
     """Run `count` trajectories and write them as `name`, whole or not at all."""
     runs = [run_trajectory(env, job.recipe, job.shares, job.seed, context, first + number) for number in range(count)]
     buffer = io.BytesIO()
-    np.savez(buffer, **{key: np.concatenate([run[key] for run in runs]) for key in runs[0]})
+    np.savez_compressed(buffer, **{key: np.concatenate([run[key] for run in runs]) for key in runs[0]})
     write_atomic(job.shards / name, buffer.getvalue())
     return {"shard": name, "trajectories": count}
 
