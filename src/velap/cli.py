@@ -152,7 +152,7 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
     from velap.data import minari_io
     from velap.tasks import get_task
 
-    if not minari_io.dataset_path(get_task(task).dataset_id).exists():
+    if not minari_io.exists(get_task(task).dataset_id):
         collect(task, workers=workers)
     checkpoint = _train(task, preset, seed, out, None, device, True, settings)
     OUT.print(f"checkpoint {checkpoint}", markup=False)

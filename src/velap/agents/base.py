@@ -37,7 +37,10 @@ class Agent(Protocol):
         ...
 
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Stacked frames [B, N, H, W, 3], oldest first -> actions [B, A] in the environment's own range."""
+        """Stacked frames [B, N, H, W, 3], oldest first -> actions [B, A] in the environment's own range.
+
+        A batch of another size than the last one starts new episodes in all rows.
+        """
         ...
 
 

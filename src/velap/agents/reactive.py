@@ -37,7 +37,9 @@ class RandomAgent:
             self._generators[row] = np.random.default_rng(seed)
 
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Actions [B, A]; the frames are not looked at."""
+        """Uniform actions [B, A]; of the frames only the number counts."""
+        if len(frames) != len(self._generators):
+            self.reset(np.ones(len(frames), bool))
         draws = [generator.uniform(self._low, self._high) for generator in self._generators]
         return np.stack(draws).astype(np.float32)
 
@@ -60,5 +62,7 @@ class ReactiveAgent:
     @torch.inference_mode()
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Frames [B, N, H, W, 3] -> actions [B, A]."""
+        if len(frames) != len(self.last_plan_ms):
+            self.reset(np.ones(len(frames), bool))
         latents = self._model.encode(torch.from_numpy(frames).to(self._device))
         return self._model.to_env(self._model.act_global(latents))

@@ -74,6 +74,8 @@ class VelapAgent:
     @torch.inference_mode()
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """One step of Algorithm 2: frames [B, N, H, W, 3] -> actions [B, A]."""
+        if len(frames) != len(self._generators):
+            self.reset(np.ones(len(frames), bool))
         latents = self._model.encode(torch.from_numpy(frames).to(self._device))
         near_goal = self._fns.value(latents) > self._stop_value
         self._replan(latents, (self._plan_age >= self._n_replan) & ~near_goal)

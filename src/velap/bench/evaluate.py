@@ -18,7 +18,7 @@ from velap.agents.base import Agent, make_agent
 from velap.bench.records import Record, RecordFile, RunKey, select
 from velap.bench.rollout import Episode, FrameReader, Observer, Rollout, make_envs
 from velap.config import Config
-from velap.data.reading import IMAGE_SIZE
+from velap.data.images import IMAGE_SIZE
 from velap.errors import ConfigError, UnknownTaskError
 from velap.models.latent import LatentModel, load_checkpoint
 from velap.runs import CHECKSUM

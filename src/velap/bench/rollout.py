@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from velap.agents.base import Agent
 from velap.data.episodes import stack_indices
-from velap.data.reading import find_image, to_rgb
+from velap.data.images import find_image, to_rgb
 from velap.errors import ConfigError
 
 

@@ -1,0 +1,111 @@
+"""The toy world as pixels: an environment whose frames hold its position, and an exact model that reads them.
+
+Makes agents, rollouts and videos testable without training.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from toy_world import GOAL, HALF_WIDTH, START, move, straight_to_goal, toy_fns
+from velap.config import Config, override
+
+SIDE = 8
+ACTION_SCALE = 2.0
+"""The environment's actions are this times the model's."""
+
+
+def draw(position: np.ndarray, size: int = SIDE) -> np.ndarray:
+    """Frame uint8 [size, size, 3] with x and y in red and green of every pixel."""
+    frame = np.zeros((size, size, 3), np.uint8)
+    frame[..., :2] = np.round((position + HALF_WIDTH) / (2 * HALF_WIDTH) * 255)
+    frame[..., 2] = 77
+    return frame
+
+
+def read(frames: Tensor) -> Tensor:
+    """Positions [*, 2] of the newest of stacked frames [*, N, H, W, 3]."""
+    return frames[..., -1, 0, 0, :2].double() / 255 * 2 * HALF_WIDTH - HALF_WIDTH
+
+
+class ToyEnv(gym.Env[np.ndarray, np.ndarray]):
+    """From START, moved a little by the seed, to within 1 of GOAL."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    render_mode = "rgb_array"
+    extent = (-HALF_WIDTH, HALF_WIDTH, -HALF_WIDTH, HALF_WIDTH)
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
+        self.action_space = gym.spaces.Box(-ACTION_SCALE, ACTION_SCALE, (2,), np.float32)
+        self.position = np.array(START)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.position = np.array(START) + self.np_random.uniform(-0.5, 0.5, 2)
+        return draw(self.position), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        moved = move(torch.from_numpy(self.position), torch.from_numpy(np.asarray(action, np.float64)) / ACTION_SCALE)
+        self.position = moved.numpy()
+        success = bool(np.linalg.norm(self.position - np.array(GOAL)) < 1)
+        return draw(self.position), float(success), success, False, {"success": success}
+
+    def render(self, size: int = SIDE) -> np.ndarray:  # type: ignore[override]
+        return draw(self.position, size)
+
+    def agent_position(self) -> np.ndarray:
+        return self.position.copy()
+
+    def set_agent_position(self, position: np.ndarray) -> None:
+        self.position = np.asarray(position, np.float64)
+
+    def free_positions(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        return rng.uniform(-HALF_WIDTH, HALF_WIDTH, (count, 2))
+
+
+class ToyModel(nn.Module):
+    """The exact model of the toy world, with the parts of `LatentModel` that agents use."""
+
+    def __init__(self, **changes: object) -> None:
+        super().__init__()
+        self.anchor = nn.Parameter(torch.zeros(1, dtype=torch.float64))
+        self._fns = toy_fns(**changes)
+        self.encoded_batches: list[int] = []
+
+    def encode(self, frames: Tensor) -> Tensor:
+        self.encoded_batches.append(len(frames))
+        return read(frames)
+
+    def act_local(self, latent: Tensor, goal: Tensor) -> Tensor:
+        towards = goal - latent
+        return towards / towards.norm(dim=-1, keepdim=True).clamp(min=1)
+
+    def act_global(self, latent: Tensor) -> Tensor:
+        return straight_to_goal(latent)
+
+    def value(self, latent: Tensor) -> Tensor:
+        return self._fns.value(latent)
+
+    def to_env(self, action: Tensor) -> np.ndarray:
+        return (ACTION_SCALE * action).numpy().astype(np.float32)
+
+    def search_fns(self, neighbour_distance_factor: float = 3.0) -> dict[str, object]:
+        return self._fns._asdict()
+
+
+def toy_config(**planner: object) -> Config:
+    """Config for the toy world: short simulations, replanning every 10 steps."""
+    base = Config(task="toy", preset="default")
+    settings = {"n_iter": 60, "n_sim": 3, "candidates": 20, **planner}
+    return override(base, planner=settings, controller={"n_replan": 10}, model={"frame_stack": 2})
+
+
+def toy_env() -> gym.Env[Any, Any]:
+    """The environment with a time limit of 60 steps."""
+    return gym.wrappers.TimeLimit(ToyEnv(), 60)
