@@ -17,11 +17,32 @@ from velap.training.joint import rollouts
 from velap.training.loop import MODEL, STATE, Trainer, train
 
 SMALL = ModelConfig(
-    frame_stack=2, latent_dim=4, encoder_filters=(4, 4), encoder_kernels=(4, 4), encoder_strides=(2, 2), encoder_dense=(8,),
-    dynamics_dense=(16,), generative_dense=(16,), noise_dim=2, policy_dense=(16,), critic_dense=(16,), bank_size=10,
+    frame_stack=2,
+    latent_dim=4,
+    encoder_filters=(4, 4),
+    encoder_kernels=(4, 4),
+    encoder_strides=(2, 2),
+    encoder_dense=(8,),
+    dynamics_dense=(16,),
+    generative_dense=(16,),
+    noise_dim=2,
+    policy_dense=(16,),
+    critic_dense=(16,),
+    bank_size=10,
 )
-QUICK = TrainConfig(joint_steps=6, batch_windows=3, window=5, latent_steps=6, latent_batch=8, latent_horizon=3,
-                    precision="float32", checkpoint_every=2, log_every=2, diagnose_every=4, holdout_episodes=1)
+QUICK = TrainConfig(
+    joint_steps=6,
+    batch_windows=3,
+    window=5,
+    latent_steps=6,
+    latent_batch=8,
+    latent_horizon=3,
+    precision="float32",
+    checkpoint_every=2,
+    log_every=2,
+    diagnose_every=4,
+    holdout_episodes=1,
+)
 
 
 def make_store(episodes: int = 12, length: int = 6) -> FrameStore:
@@ -33,10 +54,17 @@ def make_store(episodes: int = 12, length: int = 6) -> FrameStore:
     terminated[ends[:2]] = True
     truncated[ends[2:]] = True
     return FrameStore(
-        frames=rng.integers(0, 255, (n, 16, 16, 3), dtype=np.uint8), actions=rng.uniform(-2, 2, (n, 3)).astype(np.float32),
-        rewards=rewards, terminated=terminated, truncated=truncated, episode_start=np.arange(episodes) * (length + 1),
-        episode_length=np.full(episodes, length), action_low=np.full(3, -2, np.float32), action_high=np.full(3, 2, np.float32),
-        dataset_id="test/noise-v0", content_hash="abc",
+        frames=rng.integers(0, 255, (n, 16, 16, 3), dtype=np.uint8),
+        actions=rng.uniform(-2, 2, (n, 3)).astype(np.float32),
+        rewards=rewards,
+        terminated=terminated,
+        truncated=truncated,
+        episode_start=np.arange(episodes) * (length + 1),
+        episode_length=np.full(episodes, length),
+        action_low=np.full(3, -2, np.float32),
+        action_high=np.full(3, 2, np.float32),
+        dataset_id="test/noise-v0",
+        content_hash="abc",
     )
 
 
@@ -62,7 +90,13 @@ def test_model_loss_reaches_encoder_dynamics_and_critics_only(tmp_path, norm):
     model = run.model
     for part in (model.encoder, model.dynamics, model.local_critics, model.global_critic):
         assert touched(part)
-    for part in (model.local_policy, model.global_policy, model.action_model, run.learner.local_target, run.learner.global_target):
+    for part in (
+        model.local_policy,
+        model.global_policy,
+        model.action_model,
+        run.learner.local_target,
+        run.learner.global_target,
+    ):
         assert not touched(part)
 
 
@@ -73,8 +107,11 @@ def test_policy_step_reaches_policies_and_action_model_only(tmp_path, norm):
     batch = run.sampler.sample(3, 5, True, run.generator)
     before = {k: v.clone() for k, v in model.state_dict().items()}
     learner._update_policies(model.encode(run.sampler.stacks(batch.rows)).detach(), batch)
-    changed = {k.split(".")[0] for k, v in model.state_dict().items() if not torch.equal(v, before[k]) and "running" not in k
-               and "num_batches" not in k}
+    changed = {
+        k.split(".")[0]
+        for k, v in model.state_dict().items()
+        if not torch.equal(v, before[k]) and "running" not in k and "num_batches" not in k
+    }
     assert changed == {"local_policy", "global_policy", "action_model"}
     assert not touched(model.encoder) and not touched(model.local_critics) and not touched(model.global_critic)
 

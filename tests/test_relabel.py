@@ -21,9 +21,17 @@ def make_store(lengths=(4, 6, 5), rewarded=(1,)) -> FrameStore:
     frames = np.broadcast_to(np.arange(n, dtype=np.uint8)[:, None, None, None], (n, 8, 8, 3)).copy()
     actions = np.arange(n, dtype=np.float32)[:, None] / n
     return FrameStore(
-        frames=frames, actions=actions, rewards=rewards, terminated=terminated, truncated=truncated,
-        episode_start=starts.astype(np.int64), episode_length=np.array(lengths, np.int64),
-        action_low=-np.ones(1, np.float32), action_high=np.ones(1, np.float32), dataset_id="test/rows-v0", content_hash="0",
+        frames=frames,
+        actions=actions,
+        rewards=rewards,
+        terminated=terminated,
+        truncated=truncated,
+        episode_start=starts.astype(np.int64),
+        episode_length=np.array(lengths, np.int64),
+        action_low=-np.ones(1, np.float32),
+        action_high=np.ones(1, np.float32),
+        dataset_id="test/rows-v0",
+        content_hash="0",
     )
 
 

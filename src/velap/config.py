@@ -34,7 +34,8 @@ class ModelConfig:
     latent_dim: int = 32
     """d_Z, Table 7."""
     norm: Norm = "layer"
-    """Normalisation of hidden layers. Tables 2-6: batch. ours: layer, no train/eval gap and no batch statistics in targets."""
+    """Normalisation of hidden layers. Tables 2-6: batch. ours: layer, no train/eval gap and no batch statistics in
+    targets."""
     encoder_filters: tuple[int, ...] = (32, 32, 64, 64)
     """Table 2."""
     encoder_kernels: tuple[int, ...] = (4, 4, 4, 4)
@@ -84,7 +85,8 @@ class TrainConfig:
     batch_windows: int = 12
     """Windows of consecutive frames a batch. Table 7: 64 transitions, so 64 windows with `whole_windows` off."""
     window: int = 20
-    """Transitions a window [steps]. ours; `dynamics_horizon` in `paper`, where only the first transition trains the values."""
+    """Transitions a window [steps]. ours; `dynamics_horizon` in `paper`, where only the first transition trains the
+    values."""
     whole_windows: bool = True
     """Every transition of a window trains the values, and goals come from the encoded frames. ours; off in `paper`."""
     learning_rate: float = 3e-4
@@ -143,8 +145,17 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name in ("joint_steps", "latent_steps"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more steps")
-        for name in ("batch_windows", "window", "dynamics_horizon", "policy_every", "latent_batch", "latent_horizon",
-                     "log_every", "diagnose_every", "checkpoint_every"):
+        for name in (
+            "batch_windows",
+            "window",
+            "dynamics_horizon",
+            "policy_every",
+            "latent_batch",
+            "latent_horizon",
+            "log_every",
+            "diagnose_every",
+            "checkpoint_every",
+        ):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("learning_rate", "latent_learning_rate", "temperature"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
@@ -159,10 +170,18 @@ class TrainConfig:
             (self.relabel_next, self.relabel_future, self.relabel_other),
             "three shares of 0 or more that add up to 1",
         )
-        _require(self.dynamics_loss in get_args(DynamicsLoss), "dynamics_loss", self.dynamics_loss,
-                 f"one of {get_args(DynamicsLoss)}")
-        _require(self.window >= self.dynamics_horizon, "window", self.window,
-                 f"at least dynamics_horizon = {self.dynamics_horizon} steps")
+        _require(
+            self.dynamics_loss in get_args(DynamicsLoss),
+            "dynamics_loss",
+            self.dynamics_loss,
+            f"one of {get_args(DynamicsLoss)}",
+        )
+        _require(
+            self.window >= self.dynamics_horizon,
+            "window",
+            self.window,
+            f"at least dynamics_horizon = {self.dynamics_horizon} steps",
+        )
         _require(self.precision in get_args(Precision), "precision", self.precision, f"one of {get_args(Precision)}")
 
 
@@ -189,7 +208,8 @@ class PlannerConfig:
     neighbour_distance_factor: float = 3.0
     """d_neigh is this times the upper 5-percentile of one-step latent distances, Table 8."""
     max_neighbours: int = 16
-    """M, nearest tree nodes that a candidate is compared with inside d_neigh. ours: the paper compares with all of them, which
+    """M, nearest tree nodes that a candidate is compared with inside d_neigh. ours: the paper compares with all of them,
+    which
     is the same as long as no more than M lie within d_neigh."""
     p_sparse: float = 0.4
     """p^sparse of the node sampling mixture. ours: the paper gives no number."""
@@ -202,9 +222,11 @@ class PlannerConfig:
     p_policy: float = 0.2
     """p^policy: an expansion acts by π^g instead of g. ours: the paper gives no number."""
     coherent_noise: bool = True
-    """Draw the action noise once a simulation instead of once a step (the data are correlated walks). ours; off in `paper`."""
+    """Draw the action noise once a simulation instead of once a step (the data are correlated walks). ours; off in
+    `paper`."""
     anchor: Anchor = "none"
-    """What to do with candidates by their nearest dataset latent: nothing, reject beyond `anchor_factor`, or also snap. ours."""
+    """What to do with candidates by their nearest dataset latent: nothing, reject beyond `anchor_factor`, or also snap.
+    ours."""
     anchor_factor: float = 1.0
     """Largest distance to a dataset latent, in upper 5-percentiles of one-step distances. ours."""
 
@@ -259,7 +281,9 @@ class Config:
         try:
             raw = json.loads(text)
         except json.JSONDecodeError as error:
-            raise ConfigError(f"the config is not JSON ({error}); expected the text that velap saved. Restore the file.") from error
+            raise ConfigError(
+                f"the config is not JSON ({error}); expected the text that velap saved. Restore the file."
+            ) from error
         return _build(Config, raw, "config")
 
 
@@ -270,8 +294,10 @@ def _build(cls: type, raw: Any, where: str) -> Any:
     hints = get_type_hints(cls)
     unknown = sorted(set(raw) - set(hints))
     if unknown:
-        raise ConfigError(f"`{where}` has unknown fields {unknown}; expected some of {sorted(hints)}. "
-                          "The file may come from another version of velap.")
+        raise ConfigError(
+            f"`{where}` has unknown fields {unknown}; expected some of {sorted(hints)}. "
+            "The file may come from another version of velap."
+        )
     values = {}
     for name, value in raw.items():
         hint = hints[name]
@@ -300,5 +326,11 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 PAPER_MODEL: dict[str, Any] = {"norm": "batch", "dynamics_residual": False, "critic_bounded": False, "bank_size": 0}
-PAPER_TRAIN: dict[str, Any] = {"batch_windows": 64, "window": 3, "whole_windows": False, "latent_steps": 0, "joint_steps": 100_000}
+PAPER_TRAIN: dict[str, Any] = {
+    "batch_windows": 64,
+    "window": 3,
+    "whole_windows": False,
+    "latent_steps": 0,
+    "joint_steps": 100_000,
+}
 PAPER_PLANNER: dict[str, Any] = {"coherent_noise": False, "anchor": "none", "discard_low_exponent": None}

@@ -90,20 +90,27 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and metadata, the checksum verified; raises CheckpointError."""
     path = Path(path)
     if not path.is_file():
-        raise CheckpointError(f"no checkpoint at {path}; expected a .safetensors file that velap wrote. "
-                              "Check the path, or train one with `velap train TASK`.")
+        raise CheckpointError(
+            f"no checkpoint at {path}; expected a .safetensors file that velap wrote. "
+            "Check the path, or train one with `velap train TASK`."
+        )
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - safe_open is no dict
     except (SafetensorError, OSError, ValueError) as error:
-        raise CheckpointError(f"{path} is not a readable safetensors file ({error}); it is damaged or truncated. "
-                              "Restore it from a copy, or train again.") from error
+        raise CheckpointError(
+            f"{path} is not a readable safetensors file ({error}); it is damaged or truncated. "
+            "Restore it from a copy, or train again."
+        ) from error
     if CHECKSUM not in metadata:
-        raise CheckpointError(f"{path} carries no checksum; expected a file that velap wrote. Foreign weights are not loaded.")
+        raise CheckpointError(
+            f"{path} carries no checksum; expected a file that velap wrote. Foreign weights are not loaded."
+        )
     if _digest(tensors, metadata) != metadata[CHECKSUM]:
-        raise CheckpointError(f"{path} is damaged: its content does not match the SHA-256 it carries. "
-                              "Restore it from a copy, or train again.")
+        raise CheckpointError(
+            f"{path} is damaged: its content does not match the SHA-256 it carries. Restore it from a copy, or train again."
+        )
     return tensors, metadata
 
 

@@ -64,8 +64,9 @@ class WindowSampler:
             raise DatasetError("the dataset has no transition to train on; expected episodes of at least one step.")
 
     def sample(self, windows: int, length: int, whole: bool, generator: torch.Generator) -> Batch:
-        """B `windows` of L `length` steps; with `whole` every transition trains the values, else only each window's first."""
-        first, last, at = self._draw_windows(windows, length, whole, generator)
+        """B `windows` of L `length` steps; with `whole` every transition trains the values, else only each window's
+        first."""
+        _, last, at = self._draw_windows(windows, length, whole, generator)
         window_rows = torch.minimum(at[:, None] + torch.arange(length + 1, device=self.device), last[:, None])
         valid = at[:, None] + torch.arange(length, device=self.device) < last[:, None]
         used = length if whole else 1

@@ -1,4 +1,5 @@
-"""Conditional variational autoencoders (Table 4). `*` is any batch prefix, D the latent, A the action, m the noise dimension."""
+"""Conditional variational autoencoders (Table 4). `*` is any batch prefix, D the latent, A the action, m the noise
+dimension."""
 
 from __future__ import annotations
 
@@ -14,7 +15,9 @@ from velap.models.networks import MLP
 class ConditionalVAE(nn.Module):
     """β-VAE over targets given a condition: `[*, condition], [*, target]`; the action model g of Eq. 1 uses it."""
 
-    def __init__(self, condition: int, target: int, noise_dim: int, hidden: Sequence[int], norm: Norm, *, bounded: bool) -> None:
+    def __init__(
+        self, condition: int, target: int, noise_dim: int, hidden: Sequence[int], norm: Norm, *, bounded: bool
+    ) -> None:
         super().__init__()
         self.noise_dim = noise_dim
         self.bounded = bounded

@@ -19,9 +19,9 @@ from velap.models.generative import ConditionalVAE
 from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
 from velap.runs import load_tensors, save_tensors
 
-
 UNREWARDED = -4.0
-"""Initial logit of bounded critics: sparse returns start near 0; from a half they would take thousands of updates to decay."""
+"""Initial logit of bounded critics: sparse returns start near 0; from a half they would take thousands of updates to
+decay."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class LatentModel(nn.Module):
         """Environment actions `[*, A]` to [-1, 1]."""
         return ((action - self.action_low) / (self.action_high - self.action_low) * 2 - 1).clamp(-1, 1)
 
-    def search_fns(self, neighbour_distance_factor: float = 3.0):  # noqa: ANN201 - the type lives above this layer
+    def search_fns(self, neighbour_distance_factor: float = 3.0):
         """The callables that the search needs (`velap.search.types.SearchFns`); refuses a model in train mode."""
         if self.training:
             raise VelapError("the model is in train mode; expected eval mode for planning. Call model.eval() first.")
@@ -168,17 +168,24 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tup
     """Model in eval mode, its config and the metadata; raises CheckpointError on anything but an intact velap model."""
     tensors, metadata = load_tensors(Path(path))
     if metadata.get("format") != MODEL_FORMAT:
-        raise CheckpointError(f"{path} has format {metadata.get('format')!r}; expected {MODEL_FORMAT!r}. "
-                              "Give the `model.safetensors` of a run, not its training state.")
+        raise CheckpointError(
+            f"{path} has format {metadata.get('format')!r}; expected {MODEL_FORMAT!r}. "
+            "Give the `model.safetensors` of a run, not its training state."
+        )
     config = Config.from_json(metadata["config"])
     raw = json.loads(metadata["spaces"])
     spaces = Spaces(raw["height"], raw["width"], tuple(raw["action_low"]), tuple(raw["action_high"]))
     model = LatentModel(config.model, spaces, config.train.discount, config.train.precision)
     expected = model.state_dict()
-    wrong = sorted(name for name in expected.keys() | tensors.keys()
-                   if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape)
+    wrong = sorted(
+        name
+        for name in expected.keys() | tensors.keys()
+        if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape
+    )
     if wrong:
-        raise CheckpointError(f"{path} does not fit its own config: {len(wrong)} tensors differ, {wrong[0]} first. "
-                              "The file comes from another version of velap; train again.")
+        raise CheckpointError(
+            f"{path} does not fit its own config: {len(wrong)} tensors differ, {wrong[0]} first. "
+            "The file comes from another version of velap; train again."
+        )
     model.load_state_dict(tensors)
     return model.to(device).eval().requires_grad_(False), config, metadata

@@ -1,8 +1,10 @@
-"""Networks of App. B.1 (Tables 2, 3, 5, 6). `*` is any batch prefix, D the latent and A the action dimension, n the members."""
+"""Networks of App. B.1 (Tables 2, 3, 5, 6). `*` is any batch prefix, D the latent and A the action dimension, n the
+members."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -48,7 +50,7 @@ class EnsembleMLP(nn.Module):
         self.scales = nn.ParameterList()
         self.shifts = nn.ParameterList()
         self.norms = nn.ModuleList()
-        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for fan_in, fan_out in pairwise(sizes):
             bound = fan_in**-0.5
             self.weights.append(nn.Parameter(torch.empty(n, fan_in, fan_out).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.empty(n, 1, fan_out).uniform_(-bound, bound)))

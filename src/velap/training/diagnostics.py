@@ -18,7 +18,9 @@ HORIZONS = (1, 3, 10)
 
 
 @torch.no_grad()
-def diagnose(model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], cache: Tensor | None) -> dict[str, float]:
+def diagnose(
+    model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], cache: Tensor | None
+) -> dict[str, float]:
     """Rollout error and displacement (in one-step lengths), and Q^l in steps, at each horizon over held-out episodes.
 
     `episodes` are (first row, last row) pairs; `cache` [F, D] holds latents when the encoder is frozen.
@@ -35,8 +37,11 @@ def diagnose(model: LatentModel, sampler: WindowSampler, episodes: list[tuple[in
             latents, offsets = cache, [first for first, _ in episodes]
         one_step = float("nan")
         for k in HORIZONS:
-            starts = [torch.arange(o, o + last - first + 1 - k) for o, (first, last) in zip(offsets, episodes, strict=False)
-                      if last - first >= k]
+            starts = [
+                torch.arange(o, o + last - first + 1 - k)
+                for o, (first, last) in zip(offsets, episodes, strict=False)
+                if last - first >= k
+            ]
             if not starts:
                 continue
             start = torch.cat(starts).to(sampler.device)

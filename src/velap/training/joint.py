@@ -1,7 +1,9 @@
 """Joint training of the Eq. 1 bundle (Eq. 2-5, 9; App. B.4, B.5), and the latent phase that follows it (ours).
 
-Letters: M rows of a batch, T transitions, B windows, L steps a window, k rollout steps, W rollouts, D latent, A action dimension.
-Each update alternates the model (encoder, dynamics, critics) and the policies with the latents held fixed. The action model g
+Letters: M rows of a batch, T transitions, B windows, L steps a window, k rollout steps, W rollouts, D latent, A action
+dimension.
+Each update alternates the model (encoder, dynamics, critics) and the policies with the latents held fixed. The action
+model g
 learns beside the policies, on fixed latents too: Eq. 2 has no term for it.
 """
 
@@ -44,7 +46,8 @@ def evaluated(*modules: nn.Module) -> Iterator[None]:
 
 
 def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int, every_start: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """k-step predictions of h along the data's actions: predicted [k, W, D], positions int64 [k, W] of the truth, valid [k, W].
+    """k-step predictions of h along the data's actions: predicted [k, W, D], positions int64 [k, W] of the truth, valid
+    [k, W].
 
     latents [M, D]; rollouts start at every step of a window that leaves k steps, or at the first one only.
     """
@@ -161,8 +164,12 @@ class JointLearner:
             global_goal = td_target(batch.reward, batch.proceeds, next_global, config.discount)
         local, local_info = critic_loss(model.local_q(now, goal, batch.action), local_goal, weight)
         task, task_info = critic_loss(model.global_q(now, batch.action), global_goal, weight)
-        info = {"local/loss": local_info["loss"], "local/q": local_info["q"],
-                "global/loss": task_info["loss"], "global/q": task_info["q"]}
+        info = {
+            "local/loss": local_info["loss"],
+            "local/q": local_info["q"],
+            "global/loss": task_info["loss"],
+            "global/q": task_info["q"],
+        }
         return local + config.c0 * task, info
 
     def acting_loss(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
@@ -179,9 +186,14 @@ class JointLearner:
         noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)
         decoded = model.propose(now, reparameterise(mean, log_variance, noise))
         proposals, g_info = action_model_loss(decoded, batch.action, mean, log_variance, config.kl_weight, weight)
-        info = {"local/policy": local_info["loss"], "local/imitation": local_info["imitation"],
-                "global/policy": task_info["loss"], "global/imitation": task_info["imitation"],
-                "g/reconstruction": g_info["reconstruction"], "g/kl": g_info["kl"]}
+        info = {
+            "local/policy": local_info["loss"],
+            "local/imitation": local_info["imitation"],
+            "global/policy": task_info["loss"],
+            "global/imitation": task_info["imitation"],
+            "g/reconstruction": g_info["reconstruction"],
+            "g/kl": g_info["kl"],
+        }
         return local + task + proposals, info
 
     def _update_policies(self, latents: Tensor, batch: Batch) -> Info:
@@ -198,5 +210,3 @@ def encode_all(model: LatentModel, sampler: WindowSampler, chunk: int = 1024) ->
     with evaluated(model):
         rows = torch.arange(len(sampler.frames), device=sampler.device)
         return torch.cat([model.encode(sampler.stacks(part)) for part in rows.split(chunk)])
-
-

@@ -1,4 +1,5 @@
-"""Losses, one function an equation, each `(loss, info)`. Letters: T transitions, n ensemble members, k rollout steps, W rollouts,
+"""Losses, one function an equation, each `(loss, info)`. Letters: T transitions, n ensemble members, k rollout steps, W
+rollouts,
 C candidates, D latent, A action dimension. `weight` [T] is 1 for real transitions and 0 for padding.
 """
 
