@@ -1,10 +1,9 @@
 """Joint training of the Eq. 1 bundle (Eq. 2-5, 9; App. B.4, B.5), and the latent phase that follows it (ours).
 
-Letters: M rows of a batch, T transitions, B windows, L steps a window, k rollout steps, W rollouts, D latent, A action
-dimension.
+Letters: M rows of a batch, T transitions, B windows, L steps a window, k rollout steps, W rollouts, D latent dimension.
+
 Each update alternates the model (encoder, dynamics, critics) and the policies with the latents held fixed. The action
-model g
-learns beside the policies, on fixed latents too: Eq. 2 has no term for it.
+model g learns beside the policies, on fixed latents too: Eq. 2 has no term for it.
 """
 
 from __future__ import annotations

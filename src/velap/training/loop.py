@@ -1,8 +1,7 @@
 """The training loop: phases, logging, diagnostics, atomic checkpoints, exact resume.
 
 A run directory holds `config.json`, `metrics.jsonl`, TensorBoard events, `state.safetensors` (everything a resume
-needs) and, at the
-end, `model.safetensors`.
+needs) and, at the end, `model.safetensors`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Losses, one function an equation, each `(loss, info)`. Letters: T transitions, n ensemble members, k rollout steps, W
-rollouts,
-C candidates, D latent, A action dimension. `weight` [T] is 1 for real transitions and 0 for padding.
+"""Losses, one function an equation, each `(loss, info)`.
+
+Letters: T transitions, n ensemble members, k rollout steps, W rollouts, C candidates, D latent, A action dimension.
+`weight` [T] is 1 for real transitions and 0 for padding.
 """
 
 from __future__ import annotations
