@@ -4,9 +4,21 @@ from __future__ import annotations
 
 import pytest
 import torch
-from algorithm1 import reference_plan
-from toy_world import DISCOUNT, GOAL, HALF_WIDTH, TIP, geodesic, misleading_value, move, reach, roots, row_generators, toy_fns
 
+from algorithm1 import reference_plan
+from toy_world import (
+    DISCOUNT,
+    GOAL,
+    HALF_WIDTH,
+    TIP,
+    geodesic,
+    misleading_value,
+    move,
+    reach,
+    roots,
+    row_generators,
+    toy_fns,
+)
 from velap.config import PlannerConfig
 from velap.search.est import plan
 from velap.search.sampling import draw_noise
@@ -29,8 +41,10 @@ def through_walls(z: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("seed", range(6))
 def test_equals_plain_python_algorithm_1_one_candidate_at_a_time(seed: int) -> None:
     coherent = seed % 2 == 0
-    cfg = PlannerConfig(n_iter=120, n_sim=4 if coherent else 10, candidates=1, discard_low_exponent=6.0 if coherent else None,
-                        coherent_noise=coherent, max_neighbours=121, p_policy=0.3, goal_exponent=5.0 + 6 * (seed > 2))
+    cfg = PlannerConfig(
+        n_iter=120, n_sim=4 if coherent else 10, candidates=1, discard_low_exponent=6.0 if coherent else None,
+        coherent_noise=coherent, max_neighbours=121, p_policy=0.3, goal_exponent=5.0 + 6 * (seed > 2),
+    )
     fns, z_root = toy_fns(reach=doubtful_reach, step=through_walls), roots(1, spread=1.0, seed=seed)
     found = plan(fns, z_root, cfg, torch.Generator().manual_seed(seed))
     noise = draw_noise(cfg, fns.noise_dim, z_root, torch.Generator().manual_seed(seed))
@@ -173,11 +187,11 @@ def test_iterations_count_expansions_not_rounds() -> None:
     calls: list[int] = []
 
     def counted(z: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        calls.append(z.shape[1])
+        calls.append(z.numel() // 2)
         return move(z, action)
 
     found = plan(toy_fns(step=counted), roots(2), cfg, row_generators(2))
-    assert calls == [25] * 5 + [25] * 5 + [10] * 5
+    assert calls == [2 * 25] * 5 + [2 * 25] * 5 + [2 * 10] * 5
     rejected = torch.stack(found.rejections).sum(0)
     assert (rejected + found.tree.size - 1).tolist() == [60, 60]
 

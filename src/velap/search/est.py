@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from velap.config import PlannerConfig
-from velap.search.expansion import expand_, thresholds
+from velap.search.expansion import Thresholds, Verdict, expand_, thresholds
 from velap.search.sampling import draw_noise
-from velap.search.tree import head, new_tree, take, trace_back
-from velap.search.types import Outcome, Plan, Rejections, RowGenerator, SearchFns, Tree
+from velap.search.tree import new_tree, take, trace_back, trimmed
+from velap.search.types import Plan, Rejections, RowGenerator, SearchFns, Tree
 
 
 @torch.inference_mode()
@@ -25,14 +27,15 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
     if z_root.ndim != 2:
         raise ValueError(f"z_root has shape {tuple(z_root.shape)}; expected [B, D], one root a row.")
     noise = draw_noise(cfg, fns.noise_dim, z_root, generator)
+    limits = thresholds(cfg, fns.discount, z_root)
     tree = new_tree(z_root, fns.value(z_root), cfg.n_iter + 1)
-    outcomes = []
+    verdicts = []
     for start in range(0, cfg.n_iter, cfg.candidates):
-        stop = min(start + cfg.candidates, cfg.n_iter)
-        outcomes.append(expand_(tree, fns, cfg, noise.part(start, stop), slots=start + 1))
-    tree = head(tree, cfg.n_iter + 1)
-    leaf, reached = choose_leaf(tree, thresholds(cfg, fns.discount).goal)
-    nodes, length = trace_back(tree.parents, leaf, depth=len(outcomes))
+        part = noise.part(start, min(start + cfg.candidates, cfg.n_iter))
+        verdicts.append(expand_(tree, fns, cfg, limits, part, slots=start + 1))
+    tree = trimmed(tree)
+    leaf, reached = choose_leaf(tree, limits.goal)
+    nodes, length = trace_back(tree.parents, leaf, depth=len(verdicts))
     return Plan(
         waypoints=take(tree.latents, nodes),
         length=length,
@@ -40,11 +43,11 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
         reached_goal=reached,
         nodes=nodes,
         tree=tree,
-        rejections=_count_rejections(torch.cat(outcomes, 1)),
+        rejections=count_rejections(verdicts, limits),
     )
 
 
-def choose_leaf(tree: Tree, goal_threshold: float) -> tuple[Tensor, Tensor]:
+def choose_leaf(tree: Tree, goal_threshold: Tensor | float) -> tuple[Tensor, Tensor]:
     """End of g* (Eq. 8): the goal node nearest to the root, or where there is none the node of highest Q^g.
 
     Returns:
@@ -56,6 +59,13 @@ def choose_leaf(tree: Tree, goal_threshold: float) -> tuple[Tensor, Tensor]:
     return torch.where(reached, nearest, tree.goal_values.argmax(1)), reached
 
 
-def _count_rejections(outcomes: Tensor) -> Rejections:
-    """Outcomes [B, n_iter] → counts [B]."""
-    return Rejections(**{field: (outcomes == Outcome[field.upper()]).sum(1) for field in Rejections._fields})
+def count_rejections(verdicts: Sequence[Verdict], limits: Thresholds) -> Rejections:
+    """Rejected candidates of all rounds by the first reason that holds, in the order of `Rejections`."""
+    accepted, supported, q_edge, std_edge = (torch.cat(parts, 1) for parts in zip(*verdicts, strict=True))
+    above_low, certain = q_edge > limits.low, std_edge < limits.std
+    return Rejections(
+        unsupported=(~supported).sum(1),
+        low=(supported & ~above_low).sum(1),
+        std=(supported & above_low & ~certain).sum(1),
+        high=(supported & above_low & certain & ~accepted).sum(1),
+    )

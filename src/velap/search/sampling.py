@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from velap.config import PlannerConfig
-from velap.search.types import RowGenerator, Tree
+from velap.search.types import RowGenerator
 
 
 class Noise(NamedTuple):
@@ -27,33 +28,48 @@ class Noise(NamedTuple):
 
 
 def draw_noise(cfg: PlannerConfig, noise_dim: int, like: Tensor, generator: RowGenerator) -> Noise:
-    """All random numbers of a plan for the roots `like` [B, D], in their dtype and on their device.
-
-    A sequence of generators, one a row, makes a row's numbers independent of the other rows.
-    """
+    """All random numbers of a plan for the roots `like` [B, D], in their dtype and on their device."""
     steps = 1 if cfg.coherent_noise else cfg.n_sim
+    node, policy = uniform((2, cfg.n_iter), like, generator).unbind(1)
+    return Noise(node, policy, normal((cfg.n_iter, steps, noise_dim), like, generator))
+
+
+def uniform(shape: tuple[int, ...], like: Tensor, generator: RowGenerator) -> Tensor:
+    """[B, *shape] uniform in [0, 1) for the rows of `like` [B, ...]."""
+    return _draw(torch.rand, shape, like, generator)
+
+
+def normal(shape: tuple[int, ...], like: Tensor, generator: RowGenerator) -> Tensor:
+    """[B, *shape] standard normal for the rows of `like` [B, ...]."""
+    return _draw(torch.randn, shape, like, generator)
+
+
+def _draw(draw: Callable[..., Tensor], shape: tuple[int, ...], like: Tensor, generator: RowGenerator) -> Tensor:
+    """Numbers in the dtype and on the device of `like`, drawn where the generator lives, row by row from a sequence."""
+    rows = len(like)
     if isinstance(generator, torch.Generator):
-        return _draw(cfg.n_iter, steps, noise_dim, like, generator, like.shape[0])
-    if len(generator) != like.shape[0]:
-        raise ValueError(f"got {len(generator)} generators for {like.shape[0]} rows; expected one a row, or a single one.")
-    rows = [_draw(cfg.n_iter, steps, noise_dim, like, row_generator, 1) for row_generator in generator]
-    return Noise(*(torch.cat(parts) for parts in zip(*rows, strict=True)))
+        return draw(rows, *shape, generator=generator, dtype=like.dtype, device=generator.device).to(like.device)
+    if len(generator) != rows:
+        raise ValueError(f"got {len(generator)} generators for {rows} rows; expected one a row, or a single one.")
+    drawn = [draw(*shape, generator=one, dtype=like.dtype, device=one.device) for one in generator]
+    return torch.stack(drawn).to(like.device)
 
 
-def _draw(n: int, steps: int, noise_dim: int, like: Tensor, generator: torch.Generator, rows: int) -> Noise:
-    options = {"generator": generator, "dtype": like.dtype, "device": generator.device}
-    node, policy = torch.rand(2, rows, n, **options).to(like.device)
-    return Noise(node, policy, torch.randn(rows, n, steps, noise_dim, **options).to(like.device))
+def node_distribution(neighbour_counts: Tensor, goal_values: Tensor, used: Tensor, cfg: PlannerConfig) -> Tensor:
+    """P_node [B, N]: p^sparse of Eq. 6, p^value of Eq. 7, the rest uniform; 0 on unused slots.
 
-
-def node_distribution(tree: Tree, cfg: PlannerConfig) -> Tensor:
-    """P_node [B, N]: p^sparse of Eq. 6, p^value of Eq. 7, the rest uniform; 0 on unused slots."""
-    used = torch.arange(tree.parents.shape[1], device=tree.size.device) < tree.size.unsqueeze(1)
-    crowding = tree.neighbour_counts.to(tree.goal_values.dtype) / -cfg.temperature_sparse
-    sparse = crowding.masked_fill_(~used, -torch.inf).softmax(1)
-    value = (tree.goal_values / cfg.temperature_value).softmax(1)
-    uniform = used / tree.size.unsqueeze(1)
-    return cfg.p_sparse * sparse + cfg.p_value * value + max(0.0, 1 - cfg.p_sparse - cfg.p_value) * uniform
+    Args:
+        neighbour_counts: [B, N] int64 n^neigh.
+        goal_values: [B, N] Q^g [Q-value], -inf on unused slots.
+        used: [B, N] bool.
+        cfg: the mixture and its temperatures.
+    """
+    crowding = (neighbour_counts / -cfg.temperature_sparse).masked_fill_(~used, -torch.inf)
+    sparse = crowding.softmax(1, dtype=goal_values.dtype)
+    value = (goal_values / cfg.temperature_value).softmax(1)
+    mixture = cfg.p_sparse * sparse + cfg.p_value * value
+    uniform_share = 1 - cfg.p_sparse - cfg.p_value
+    return mixture + used * (uniform_share / used.sum(1, keepdim=True)) if uniform_share > 0 else mixture
 
 
 def sample_nodes(distribution: Tensor, uniform: Tensor, size: Tensor) -> Tensor:

@@ -54,9 +54,9 @@ def new_tree(z_root: Tensor, goal_value: Tensor, capacity: int) -> Tree:
     return tree
 
 
-def head(tree: Tree, slots: int) -> Tree:
-    """A view of the first `slots` slots: cheaper to look at while later ones cannot be in use yet."""
-    fields = {f.name: getattr(tree, f.name)[:, :slots] for f in dataclasses.fields(tree) if f.name != "size"}
+def trimmed(tree: Tree) -> Tree:
+    """A view without the sink."""
+    fields = {f.name: getattr(tree, f.name)[:, :-1] for f in dataclasses.fields(tree) if f.name != "size"}
     return Tree(size=tree.size, **fields)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import NamedTuple
 
 import torch
@@ -45,27 +44,17 @@ class SearchFns(NamedTuple):
     """Latents [*, D] → nearest dataset latent [*, D] and its distance [*]; None where the model keeps no bank."""
 
 
-class Outcome(IntEnum):
-    """What became of a candidate; of several reasons the first in this order is kept."""
-
-    ACCEPTED = 0
-    UNSUPPORTED = 1
-    """Farther than `anchor_factor` one-step distances from every dataset latent (ours)."""
-    LOW = 2
-    """Q_min^{exp,new} is not above τ_low: too far from the node it was expanded from (Alg. 1, line 13)."""
-    STD = 3
-    """Q_std^{exp,new} is not below τ_std: the ensemble disagrees (Alg. 1, line 13)."""
-    HIGH = 4
-    """Some Q_min^{i,new} is not below τ_high: a node of the tree, or an earlier one of the round, is too close (line 14)."""
-
-
 class Rejections(NamedTuple):
-    """Candidates a plan rejected, by reason, int64 [B] each; with `tree.size - 1` accepted ones they add up to n_iter."""
+    """Candidates that a plan rejected, int64 [B] each, by the first reason that held; n_iter less `tree.size - 1` in all."""
 
     unsupported: Tensor
+    """Farther than `anchor_factor` one-step distances from every dataset latent (ours)."""
     low: Tensor
+    """Q_min^{exp,new} is not above τ_low: too far from the node it was expanded from (Alg. 1, line 13)."""
     std: Tensor
+    """Q_std^{exp,new} is not below τ_std: the ensemble disagrees (Alg. 1, line 13)."""
     high: Tensor
+    """Some Q_min^{i,new} is not below τ_high: a node of the tree, or an earlier one of the round, is too close (line 14)."""
 
 
 @dataclass(frozen=True)
