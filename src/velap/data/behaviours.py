@@ -20,7 +20,7 @@ Behaviour = Callable[[gym.Env, Recipe, np.random.Generator], Policy]
 
 
 def random_walk(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Policy:
-    """a_0 uniform, then Gaussian steps of `recipe.action_noise` clipped to the bounds (App. C.1.1), scaled to the action space."""
+    """a_0 uniform in [-1, 1], then clipped Gaussian steps of `recipe.action_noise` (App. C.1.1), scaled to the action space."""
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)

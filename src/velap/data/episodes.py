@@ -158,8 +158,8 @@ class Extras:
 
 
 def _write_episodes(path: Path, store: FrameStore, extras: Extras) -> None:
-    """Minari's HDF5 layout. An episode's frames are one deflated chunk: Minari's own writer cuts them into six frames of a quarter
-    image and two colours, which made SpiralMaze 16 times larger and its reading 4 times slower."""
+    """Minari's HDF5 layout. An episode's frames are one deflated chunk: Minari's own writer cuts them into six frames of a
+    quarter image and two colours, which made SpiralMaze 16 times larger and its reading 4 times slower."""
     with h5py.File(path, "a", track_order=True) as file:
         for episode, (start, length) in enumerate(zip(store.episode_start, store.episode_length, strict=True)):
             steps, rows = slice(start, start + length), slice(start, start + length + 1)
