@@ -1,4 +1,4 @@
-"""Environments: importing this package registers every task of `velap.tasks` with Gymnasium. Physics and drawing load on `make`."""
+"""Environments: an import registers every task of `velap.tasks`; physics and drawing load on `gymnasium.make`."""
 
 from __future__ import annotations
 

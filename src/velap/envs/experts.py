@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ def follow_shortest_path(layout: Layout, position: NDArray[np.float64], step_len
 
 def _point_along(path: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
     """The point [2] at `distance` [m] along a polyline path[L, 2]; its end if it is shorter."""
-    for start, end in zip(path, path[1:], strict=False):
+    for start, end in pairwise(path):
         length = float(np.linalg.norm(end - start))
         if length >= distance:
             return start + (end - start) * (distance / length)

@@ -1,7 +1,7 @@
 """Plane geometry of the block mazes (App. C.1): rectangles, free space of the block's centre, exact shortest paths.
 
-Pure Python and NumPy, no physics. The block is an axis-aligned square that never turns, so its centre may be anywhere outside the
-walls grown by half a block, and a shortest path bends only at convex corners of those grown walls. All lengths in metres.
+No physics here. The block is an axis-aligned square that never turns, so its centre may be anywhere outside the walls grown
+by half a block, and a shortest path bends only at convex corners of those grown walls. All lengths are in metres.
 
 Letters: P points, N nodes (corners), W walls.
 """
@@ -12,6 +12,7 @@ import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +95,7 @@ class Layout:
                 below = y_min <= goal.y_min
                 goal = Rect(goal.x_min, y_max if below else goal.y_min, goal.x_max, goal.y_max if below else y_min)
             else:
-                raise ValueError(f"wall corner inside the goal {self.goal}; expected walls that line it. Move the goal or the wall.")
+                raise ValueError(f"wall corner inside the goal {self.goal}; expected walls that line it. Move one of them.")
         return goal
 
     def is_free(self, points: Points) -> NDArray[np.bool_]:
@@ -106,7 +107,7 @@ class Layout:
         return ~hit.any(-1) & self.workspace.contains(points)
 
     def nearest_free(self, point: Points) -> Points:
-        """point[2] [m] -> itself if free, else pushed out of each wall by the shortest way; for points just inside a wall."""
+        """point[2] [m] -> itself if free, else pushed out of each wall the shortest way; for points just inside a wall."""
         point = np.array(point, dtype=np.float64)
         for x_min, y_min, x_max, y_max in self._grown:
             depths = np.array([point[0] - x_min, x_max - point[0], point[1] - y_min, y_max - point[1]])
@@ -128,7 +129,7 @@ class Layout:
                 first, second = (low - origin) / delta, (high - origin) / delta
             enter = np.maximum(enter, np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(first, second)))
             leave = np.minimum(leave, np.where(still, np.inf, np.maximum(first, second)))
-        return (enter >= leave).all(-1)
+        return np.asarray((enter >= leave).all(-1))
 
     @cached_property
     def corners(self) -> Points:
@@ -139,7 +140,7 @@ class Layout:
 
     @cached_property
     def _corner_distance(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Dijkstra outwards from the goal: distance [N] [m] (inf if cut off) and next corner [N] (-1: straight to the goal)."""
+        """Dijkstra outwards from the goal: distance [N] [m] (inf if cut off), next corner [N] (-1: straight to the goal)."""
         nodes = self.corners
         target = self.reachable_goal.nearest(nodes)
         straight = np.linalg.norm(nodes - target, axis=-1)
@@ -203,11 +204,8 @@ class Layout:
 
 def polyline_walls(vertices: Iterable[tuple[float, float]], thickness: float) -> tuple[Rect, ...]:
     """One wall per leg of an axis-aligned polyline [m], with square ends, so that neighbours share their corner square."""
-    points = list(vertices)
-    half = thickness / 2
-    return tuple(
-        Rect(min(a, c), min(b, d), max(a, c), max(b, d)).grown(half) for (a, b), (c, d) in zip(points, points[1:], strict=False)
-    )
+    legs = pairwise(vertices)
+    return tuple(Rect(min(a, c), min(b, d), max(a, c), max(b, d)).grown(thickness / 2) for (a, b), (c, d) in legs)
 
 
 def frame_walls(workspace: Rect, thickness: float) -> tuple[Rect, ...]:

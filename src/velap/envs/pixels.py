@@ -5,6 +5,7 @@ Shapes: frames are uint8 [H, W, 3], RGB, first row at the top.
 
 from __future__ import annotations
 
+import atexit
 import os
 import threading
 from abc import abstractmethod
@@ -27,20 +28,17 @@ Frame = NDArray[np.uint8]
 
 
 class Renderer:
-    """Draws square frames of one camera off screen. Shadows, reflections, fog, sky and multisampling are off: they cost most."""
+    """Draws square frames of a fixed camera. Shadows, reflections, fog, sky and multisampling are off: they cost most."""
 
     def __init__(self, model: Any, size: int) -> None:
         """`model` is any MjModel with the same meshes and textures as those drawn later; `size` [px]."""
         self.size = size
-        self._gl, self.backend = make_context(size)
         # the only fields of the model that a context reads besides its assets; put back, since models are shared
         quality, visual = model.vis.quality, model.vis.global_
         before = quality.offsamples, quality.shadowsize, visual.offwidth, visual.offheight
         quality.offsamples, quality.shadowsize, visual.offwidth, visual.offheight = 0, 0, size, size
         try:
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
-        except Exception as error:
-            raise render_error(f"{self.backend} cannot draw: {type(error).__name__}: {error}") from error
+            self._gl, self._context, self.backend = make_context(model, size)
         finally:
             quality.offsamples, quality.shadowsize, visual.offwidth, visual.offheight = before
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
@@ -75,14 +73,21 @@ _renderers: dict[tuple[Any, ...], Renderer] = {}
 
 
 def shared_renderer(assets: str, model: Any, size: int) -> Renderer:
-    """The renderer of this process and thread for models that share `assets` (a name of the caller's) and frames of `size` [px].
+    """The renderer of this process and thread for frames of `size` [px] of models with the same `assets`, a name.
 
     A context costs a hundred frames to make, so that environments of one kind share one; a forked child makes its own.
     """
     key = (os.getpid(), threading.get_ident(), assets, size)
     if key not in _renderers:
         _renderers[key] = Renderer(model, size)
+        atexit.register(_close, key)  # registered after MuJoCo's own clean-up, hence run before it
     return _renderers[key]
+
+
+def _close(key: tuple[Any, ...]) -> None:
+    """Free a renderer, in the process that made it."""
+    if key[0] == os.getpid():
+        _renderers.pop(key).close()
 
 
 class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
@@ -104,8 +109,8 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
 
     @abstractmethod
-    def _start(self, rng: np.random.Generator, split: str) -> None:
-        """Put the world into a start state of the split."""
+    def _start(self, rng: np.random.Generator, split: str, context: int | None) -> None:
+        """Put the world into a start state of the split, in that context or in a random one."""
 
     @abstractmethod
     def _advance(self, action: NDArray[np.float64]) -> None:
@@ -120,7 +125,12 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
         """Where the agent is [2 or 3] [m]."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Frame, dict[str, Any]]:
-        """Start an episode. `options={"split": "train"}` starts as in data collection, "test" (the default) as in evaluation."""
+        """Start an episode.
+
+        `options` may hold `split`: "train" starts as in data collection, "test" (the default) as in evaluation; and
+        `context`: the number of an initialisation of all but the agent (Table 10), by default drawn anew. Tasks with one
+        context ignore it.
+        """
         super().reset(seed=seed)
         self.start(options)
         return self.render(), {"success": False}
@@ -128,10 +138,11 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
     def start(self, options: dict[str, Any] | None = None) -> None:
         """`reset` without seeding and without a frame."""
         options = options or {}
-        split = options.get("split", "test")
-        if split not in SPLITS or set(options) - {"split"}:
-            raise ConfigError(f"reset options are {options!r}; expected {{'split': one of {SPLITS}}}.")
-        self._start(self.np_random, split)
+        split, context = options.get("split", "test"), options.get("context")
+        numbered = context is None or (isinstance(context, int) and context >= 0)
+        if not (set(options) <= {"split", "context"} and split in SPLITS and numbered):
+            raise ConfigError(f"reset options are {options!r}; expected split, one of {SPLITS}, or context, an int from 0.")
+        self._start(self.np_random, split, context)
 
     def step(self, action: NDArray[np.floating[Any]]) -> tuple[Frame, float, bool, bool, dict[str, Any]]:
         """One control step; actions outside the bounds are clipped."""
@@ -144,17 +155,17 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
         assert isinstance(space, gymnasium.spaces.Box)
         values = np.asarray(action, dtype=np.float64)
         if values.shape != space.shape or not np.isfinite(values).all():
-            raise ConfigError(f"the action is {action!r}; expected {space.shape} finite numbers between {space.low} and {space.high}.")
+            raise ConfigError(f"the action is {action!r}; expected {space.shape} finite numbers within the action space.")
         self._advance(np.clip(values, space.low, space.high))
         return self.succeeded()
 
-    def render(self, size: int = FRAME_SIZE) -> Frame:  # type: ignore[override]
+    def render(self, size: int = FRAME_SIZE) -> Frame:
         """The static camera's view, uint8 [size, size, 3], owned by the caller."""
         return shared_renderer(self.assets, self.model, size).draw(self.model, self.data)
 
 
 class FrameStack(gymnasium.ObservationWrapper[NDArray[np.uint8], NDArray[np.float32], Frame]):
-    """The last `count` frames, uint8 [count, H, W, 3], oldest first; an episode's first frame stands in for those before it."""
+    """The last `count` frames, uint8 [count, H, W, 3], oldest first; the first stands in for those before the episode."""
 
     def __init__(self, env: gymnasium.Env[Frame, NDArray[np.float32]], count: int) -> None:
         super().__init__(env)
@@ -166,7 +177,7 @@ class FrameStack(gymnasium.ObservationWrapper[NDArray[np.uint8], NDArray[np.floa
         self.observation_space = gymnasium.spaces.Box(0, 255, (count, *space.shape), np.uint8)
         self._frames: deque[Frame] = deque(maxlen=count)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Frame, dict[str, Any]]:
         """Forget the last episode."""
         self._frames.clear()
         return super().reset(seed=seed, options=options)

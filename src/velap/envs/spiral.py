@@ -1,7 +1,7 @@
 """Where the walls of SpiralMaze stand (App. C.1.1, Fig. 2a). ours: the paper gives no dimensions.
 
-Drawn in pixels of the 64×64 frame, x to the right and y up, the origin in the lower left corner. Five by five cells of 10 px, inner
-walls of 2 px, outer walls of 3 px: the corridor runs two loops from the lower left cell to the middle one.
+Drawn in pixels of the 64×64 frame, x to the right and y up, the origin in the lower left corner. Five by five cells of 10
+px, inner walls of 2 px, outer walls of 3 px: the corridor runs two loops from the lower left cell to the middle one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _BLOCK = 4.5
 so that the frame tells its position to half a pixel. It leaves 5.5 px of freedom across the corridor."""
 _INNER_CENTRELINE = ((0, 14), (50, 14), (50, 50), (14, 50), (14, 26), (38, 26), (38, 38), (26, 38))
 _GOAL = (31.5, 27.0, 37.0, 37.0)
-"""Inner end of the corridor, from wall to wall."""
+"""Inner end of the corridor, from wall to wall. Its depth sets the share of successful transitions, see Table 10: 0.12 %."""
 _TEST_STARTS = (5.5, 5.5, 9.5, 10.5)
 """Block centres, in the lower left cell."""
 
