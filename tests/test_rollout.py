@@ -51,7 +51,7 @@ def test_actions_do_not_depend_on_the_batch() -> None:
     def positions(batch: int) -> dict[int, np.ndarray]:
         seen: dict[int, list[np.ndarray]] = {}
 
-        def watch(row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, ended: bool) -> None:
+        def watch(row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
             seen.setdefault(seed, []).append(env.unwrapped.agent_position())  # type: ignore[attr-defined]
 
         play(toy_agent(), range(5), batch, max_steps=15, observer=watch)

@@ -39,6 +39,10 @@ class VelapAgent:
         """Plan of the rows `planned_rows`, kept for figures and videos."""
         self.planned_rows: NDArray[np.int64] = np.empty(0, np.int64)
         """[P] rows that planned in the last `act`."""
+        self.last_values: NDArray[np.float32] = np.empty(0, np.float32)
+        """[B] Q^g of the last states [Q-value]."""
+        self.near_goal: NDArray[np.bool_] = np.empty(0, bool)
+        """[B] rows that π^g led in the last `act` because the goal was near."""
         self._model = model
         self._fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
         self._planner = config.planner
@@ -77,7 +81,9 @@ class VelapAgent:
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
         latents = self._model.encode(torch.from_numpy(frames).to(self._device))
-        near_goal = self._fns.value(latents) > self._stop_value
+        values = self._fns.value(latents)
+        near_goal = values > self._stop_value
+        self.last_values, self.near_goal = values.float().cpu().numpy(), near_goal.cpu().numpy()
         self._replan(latents, (self._plan_age >= self._n_replan) & ~near_goal)
         self._advance(latents)
         self._plan_age += 1

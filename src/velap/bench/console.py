@@ -74,6 +74,13 @@ class EpisodeView(View):
         super().__init__(console, title, total)
         self._episodes = 0
         self._solved = 0
+        self._steps = 0
+
+    def step(self, row: int) -> None:
+        """One more environment step of `row`; shown with row 0, between the episodes' ends."""
+        if row == 0:
+            self._steps += 1
+            self.show(self._episodes, f"{self._solved} solved, step {self._steps}")
 
     def __call__(self, record: Record) -> None:
         """One more record."""

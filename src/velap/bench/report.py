@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 from scipy.stats import binomtest
 
@@ -91,9 +92,9 @@ def cells(summary: Summary) -> tuple[str, ...]:
 
 def rich_table(summaries: Iterable[Summary]) -> Table:
     """The table of several runs for a terminal."""
-    table = Table(*COLUMNS)
+    table = Table(*map(escape, COLUMNS))
     for summary in summaries:
-        table.add_row(*cells(summary))
+        table.add_row(*map(escape, cells(summary)))
     return table
 
 
@@ -101,7 +102,7 @@ def summary_table(summary: Summary) -> Table:
     """One run for a terminal, a line a number."""
     table = Table(show_header=False)
     for name, cell in zip(COLUMNS, cells(summary), strict=True):
-        table.add_row(name, cell)
+        table.add_row(escape(name), escape(cell))
     return table
 
 

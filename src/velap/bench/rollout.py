@@ -36,10 +36,10 @@ class Episode:
 
 
 class Observer(Protocol):
-    """Sees every state of every running episode, before the action of that state and once more after the last one."""
+    """Sees every state of every running episode: each before its action, the last one with the episode's outcome."""
 
-    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, ended: bool) -> None:
-        """Row and seed of the episode, its environment in the state at hand, the agent."""
+    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
+        """Row and seed of the episode, its environment in the state at hand, the agent, the outcome at the end."""
         ...
 
 
@@ -141,17 +141,18 @@ class Rollout:
         if np.isfinite(self._agent.last_plan_ms[index]):
             row.plan_ms.append(float(self._agent.last_plan_ms[index]))
         if self._observer is not None:
-            self._observer(index, row.seed, env, self._agent, False)
+            self._observer(index, row.seed, env, self._agent, None)
         observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
         row.frames.append(self._read(observation))
         success = succeeded(float(reward), info)
         out_of_time = truncated or (self._max_steps is not None and row.steps >= self._max_steps)
         if not (success or terminated or out_of_time):
             return None
-        if self._observer is not None:
-            self._observer(index, row.seed, env, self._agent, True)
         gave_up = bool(out_of_time and not success and not terminated)
-        return Episode(row.seed, success, row.steps, gave_up, tuple(row.plan_ms))
+        outcome = Episode(row.seed, success, row.steps, gave_up, tuple(row.plan_ms))
+        if self._observer is not None:
+            self._observer(index, row.seed, env, self._agent, outcome)
+        return outcome
 
 
 def make_envs(make: Callable[[], gym.Env[Any, Any]], count: int) -> list[gym.Env[Any, Any]]:
