@@ -43,6 +43,15 @@ def test_the_last_action_is_the_velocity_at_the_end_of_the_step(maze, action, sp
         assert np.linalg.norm(maze.data.qvel) == pytest.approx(speed * MAX_SPEED, abs=1e-3)
 
 
+def test_actions_beyond_the_bounds_are_clipped_entry_by_entry(maze):
+    ends = []
+    for action in ([7.0, 0.5], [1.0, 0.5]):
+        maze.set_agent_position(metres(7, 7))
+        maze.advance(np.array(action))
+        ends.append(maze.agent_position())
+    np.testing.assert_array_equal(ends[0], ends[1])
+
+
 def test_a_step_at_top_speed_is_one_step_length_long(maze):
     maze.set_agent_position(metres(20, 8))
     maze.advance(np.array([1, 0]))

@@ -112,6 +112,17 @@ def test_environments_of_one_kind_share_a_renderer():
     assert len(pixels._renderers) <= max(before, 1)
 
 
+def test_forked_environments_draw_the_same_frames_as_their_parent():
+    first = make("SpiralMaze").reset(seed=0)[0]
+    vector = gymnasium.vector.AsyncVectorEnv([lambda: make("SpiralMaze")] * 2, context="fork")
+    try:
+        vector.reset_async(seed=[0, 0])
+        frames, _ = vector.reset_wait(timeout=30)
+    finally:
+        vector.close(terminate=True)
+    np.testing.assert_array_equal(frames, np.stack([first, first]))
+
+
 def test_stacks_repeat_the_first_frame_then_slide():
     env = pixels.stack_frames(make("SpiralMaze"), 3)
     assert env.observation_space.shape == (3, 64, 64, 3)
