@@ -1,4 +1,7 @@
-"""Algorithm 1, Eq. 6-8 in plain Python, one candidate at a time, as the paper states them: the search's reference."""
+"""Algorithm 1, Eq. 6-8 in plain Python, one candidate at a time, as the paper states them: the search's reference.
+
+With `candidates` above 1 it is the batch processing of App. B.6: the distribution of Eq. 6-7 is renewed once a round.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +21,14 @@ def reference_plan(fns: SearchFns, root: torch.Tensor, cfg: PlannerConfig, noise
     q_min = lambda start, end: float(fns.reach(start, end)[0])  # noqa: E731
     nodes, parents, values, steps, counts = [root], [-1], [float(fns.value(root))], [0.0], [0]
     for i in range(cfg.n_iter):
-        sparse = [math.exp(-n / cfg.temperature_sparse) for n in counts]
-        value = [math.exp(q / cfg.temperature_value) for q in values]
-        uniform = 1 - cfg.p_sparse - cfg.p_value
-        weights = [cfg.p_sparse * s / sum(sparse) + cfg.p_value * v / sum(value) + uniform / len(nodes)
-                   for s, v in zip(sparse, value, strict=True)]
+        if i % cfg.candidates == 0:
+            sparse = [math.exp(-n / cfg.temperature_sparse) for n in counts]
+            value = [math.exp(q / cfg.temperature_value) for q in values]
+            uniform = 1 - cfg.p_sparse - cfg.p_value
+            weights = [cfg.p_sparse * s / sum(sparse) + cfg.p_value * v / sum(value) + uniform / len(nodes)
+                       for s, v in zip(sparse, value, strict=True)]
         target, exp = float(noise.node[0, i]) * sum(weights), 0
-        while exp < len(nodes) - 1 and sum(weights[: exp + 1]) <= target:
+        while exp < len(weights) - 1 and sum(weights[: exp + 1]) <= target:
             exp += 1
         new = nodes[exp]
         for step in range(cfg.n_sim):

@@ -10,6 +10,7 @@ from toy_world import (
     DISCOUNT,
     GOAL,
     HALF_WIDTH,
+    SPEED,
     TIP,
     geodesic,
     misleading_value,
@@ -28,22 +29,22 @@ CONFIG = PlannerConfig(n_iter=250, n_sim=5, candidates=25, discard_low_exponent=
 
 
 def doubtful_reach(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """An ensemble that disagrees in the strip y < -4."""
+    """Down is slower than up, and the ensemble disagrees in the half-plane y < -1."""
     q, std = reach(start, end)
-    return q, std + 0.1 * (end[..., 1] < -4)
+    return q * DISCOUNT ** (start - end)[..., 1].clamp(min=0), std + 0.1 * (end[..., 1] < -1)
 
 
 def through_walls(z: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
     """Dynamics that know no wall, so that the critics have something to refuse."""
-    return z + action
+    return z + SPEED * action
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_equals_plain_python_algorithm_1_one_candidate_at_a_time(seed: int) -> None:
+@pytest.mark.parametrize(("seed", "candidates"), [(0, 1), (1, 1), (2, 1), (3, 1), (4, 1), (5, 1), (6, 7), (7, 7), (8, 50)])
+def test_equals_plain_python_algorithm_1(seed: int, candidates: int) -> None:
     coherent = seed % 2 == 0
     cfg = PlannerConfig(
-        n_iter=120, n_sim=4 if coherent else 10, candidates=1, discard_low_exponent=6.0 if coherent else None,
-        coherent_noise=coherent, max_neighbours=121, p_policy=0.3, goal_exponent=5.0 + 6 * (seed > 2),
+        n_iter=100, n_sim=4 if coherent else 10, candidates=candidates, p_policy=0.3, coherent_noise=coherent,
+        discard_low_exponent=6.0 if coherent else None, max_neighbours=101, goal_exponent=5.0 + 6 * (seed > 2),
     )
     fns, z_root = toy_fns(reach=doubtful_reach, step=through_walls), roots(1, spread=1.0, seed=seed)
     found = plan(fns, z_root, cfg, torch.Generator().manual_seed(seed))
@@ -51,7 +52,7 @@ def test_equals_plain_python_algorithm_1_one_candidate_at_a_time(seed: int) -> N
     expected = reference_plan(fns, z_root[0], cfg, noise)
 
     size = len(expected["nodes"])
-    assert size > 15
+    assert size > 10
     assert found.tree.size.tolist() == [size]
     assert found.tree.parents[0, :size].tolist() == expected["parents"]
     assert found.tree.neighbour_counts[0, :size].tolist() == expected["counts"]
@@ -95,10 +96,11 @@ def test_finds_the_way_round_a_wall_where_greedy_ascent_is_stuck() -> None:
 
 
 def assert_same_row(one: Plan, many: Plan, row: int) -> None:
+    """Every choice is the same; numbers may differ in the last bit, as vectorised arithmetic depends on the batch's shape."""
     for name in ("waypoints", "length", "cost", "reached_goal", "nodes"):
-        torch.testing.assert_close(getattr(one, name)[0], getattr(many, name)[row], rtol=0, atol=0)
+        torch.testing.assert_close(getattr(one, name)[0], getattr(many, name)[row], rtol=0, atol=1e-12)
     for name in ("latents", "parents", "goal_values", "root_steps", "neighbour_counts", "size"):
-        torch.testing.assert_close(getattr(one.tree, name)[0], getattr(many.tree, name)[row], rtol=0, atol=0)
+        torch.testing.assert_close(getattr(one.tree, name)[0], getattr(many.tree, name)[row], rtol=0, atol=1e-12)
     assert [int(count[0]) for count in one.rejections] == [int(count[row]) for count in many.rejections]
 
 

@@ -1,4 +1,4 @@
-"""An exact world for the search: points in the plane, a wall, Q = γ^(geodesic distance), one step of length 1 at most.
+"""An exact world for the search: points in the plane, a wall, Q = γ^(geodesic distance).
 
 The wall is the half-line x = 0, y <= TIP, so the shortest way between two points is straight or bends once, at its tip.
 The goal value knows nothing of the wall: climbing it ends behind the wall, which only a search gets around.
@@ -16,7 +16,9 @@ TIP = 6.0
 GOAL = (6.0, 0.0)
 START = (-6.0, 0.0)
 HALF_WIDTH = 10.0
-"""The world is a square around the origin [steps]."""
+"""The world is a square around the origin."""
+SPEED = 0.97
+"""Longest step; not 1, so that no distance between nodes equals a threshold of Table 8."""
 
 
 def crosses_wall(start: Tensor, end: Tensor) -> Tensor:
@@ -28,16 +30,16 @@ def crosses_wall(start: Tensor, end: Tensor) -> Tensor:
 
 
 def geodesic(start: Tensor, end: Tensor) -> Tensor:
-    """Length [*] of the shortest way [steps]; exact."""
+    """Length [*] of the shortest way; exact."""
     tip = start.new_tensor([0.0, TIP])
     around = (start - tip).norm(dim=-1) + (tip - end).norm(dim=-1)
     return torch.where(crosses_wall(start, end), around, (start - end).norm(dim=-1))
 
 
 def move(z: Tensor, action: Tensor) -> Tensor:
-    """One step by `action` (at most of length 1); a step into the wall stays where it was."""
+    """One step by `action`, at most of length 1, times SPEED; a step into the wall stays where it was."""
     length = action.norm(dim=-1, keepdim=True)
-    end = (z + action / length.clamp(min=1)).clamp(-HALF_WIDTH, HALF_WIDTH)
+    end = (z + SPEED * action / length.clamp(min=1)).clamp(-HALF_WIDTH, HALF_WIDTH)
     return torch.where(crosses_wall(z, end).unsqueeze(-1), z, end)
 
 
@@ -81,7 +83,7 @@ def toy_fns(**changes: object) -> SearchFns:
 
 
 def roots(batch: int, spread: float = 0.0, seed: int = 0) -> Tensor:
-    """Starts [B, 2] in float64, `spread` [steps] around START."""
+    """Starts [B, 2] in float64, `spread` around START."""
     offsets = torch.rand(batch, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
     return torch.tensor([START], dtype=torch.float64) + spread * offsets
 
