@@ -20,7 +20,7 @@ Behaviour = Callable[[gym.Env, Recipe, np.random.Generator], Policy]
 
 
 def random_walk(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Policy:
-    """a_0 uniform in [-1, 1], then clipped Gaussian steps of `recipe.action_noise` (App. C.1.1), scaled to the action space."""
+    """a_0 uniform in [-1, 1], then clipped Gaussian steps of `recipe.action_noise` (C.1.1), scaled to the action space."""
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -79,7 +79,8 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
     chosen = int(rng.choice(len(names), p=[shares[name] for name in names]))
     frame, _ = env.reset(seed=reset_seed, options=reset_options(recipe, context))
     policy = BEHAVIOURS[names[chosen]](env, recipe, rng)
-    frames, positions, steps = [np.array(frame)], [position_of(env)], []
+    frames, positions = [np.array(frame)], [position_of(env)]
+    steps: list[tuple[np.ndarray, float, bool, bool]] = []
     while len(steps) < recipe.max_steps:
         action = policy(frames[-1])
         frame, reward, terminated, truncated, _ = env.step(action)

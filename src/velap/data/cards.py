@@ -104,8 +104,10 @@ def draw_coverage(store: FrameStore, positions: np.ndarray, path: Path, provenan
         axes.imshow(_empty_scene(store.frames), extent=tuple(kept["extent"]), alpha=0.45)
     hits = np.flatnonzero(store.rewards > 0) + 1
     starts = positions[store.episode_start]
-    layers = [(positions, "visited", {"s": 2, "color": "0.25", "alpha": 0.35, "linewidths": 0}),
-              (starts, "starts", {"s": 7, "color": "tab:blue", "linewidths": 0})]
+    layers: list[tuple[np.ndarray, str, dict[str, Any]]] = [
+        (positions, "visited", {"s": 2, "color": "0.25", "alpha": 0.35, "linewidths": 0}),
+        (starts, "starts", {"s": 7, "color": "tab:blue", "linewidths": 0}),
+    ]
     tests = np.asarray(kept.get("test_starts", []), dtype=np.float64)
     if tests.ndim == 2 and tests.shape[1] >= 2:
         layers.append((tests, "test starts", {"s": 14, "marker": "x", "color": "tab:green", "linewidths": 0.9}))
@@ -114,7 +116,7 @@ def draw_coverage(store: FrameStore, positions: np.ndarray, path: Path, provenan
     for points, label, style in layers:
         axes.scatter(points[:, 0], points[:, 1], label=f"{label} ({len(points):,})", **style)
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=f"{store.dataset_id}: coverage")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=4, frameon=False, fontsize="small", columnspacing=1.2, markerscale=1.5)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=4, frameon=False, fontsize="small", markerscale=1.5)
     FigureCanvasAgg(figure).print_png(str(path))
 
 

@@ -12,6 +12,7 @@ import os
 import shutil
 import time
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,7 @@ def _finished(path: Path, shard: _Shard) -> bool:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in (*_ROW_ARRAYS, *_EPISODE_ARRAYS)}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.zlib.error):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
         return False
     return len(arrays["length"]) == shard.count and len(arrays["frames"]) == int((arrays["length"] + 1).sum())
 
@@ -152,8 +153,8 @@ def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, 
     extras = Extras(
         positions=positions,
         seeds=arrays["reset_seed"].tolist(),
-        options=[{**reset_options(recipe, int(context)), "behaviour": names[int(number)]}
-                 for context, number in zip(arrays["context"], arrays["behaviour"], strict=True)],
+        options=[reset_options(recipe, int(context)) for context in arrays["context"]],
+        behaviours=[names[int(number)] for number in arrays["behaviour"]],
         env_spec=EnvSpec.from_json(description["env_spec"]) if description["env_spec"] else None,
         metadata={"algorithm_name": ", ".join(names), "author": {"velap"},
                   "description": f"{task.name}: {recipe.contexts} × {recipe.trajectories} trajectories of at most "

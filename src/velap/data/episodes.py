@@ -45,7 +45,8 @@ def stack_indices(index: Array, first: Array, n: int) -> Array:
         import torch
 
         offsets = torch.arange(1 - n, 1, device=index.device)
-        return torch.maximum(index.unsqueeze(-1) + offsets, first.unsqueeze(-1))
+        rows: Any = torch.maximum(index.unsqueeze(-1) + offsets, first.unsqueeze(-1))
+        return rows
     newest, oldest = np.asarray(index, dtype=np.int64), np.asarray(first, dtype=np.int64)
     return np.maximum(newest[..., None] + np.arange(1 - n, 1), oldest[..., None])
 
@@ -149,6 +150,8 @@ class Extras:
     """[E] seed of each episode's reset."""
     options: Sequence[dict[str, Any]] | None = None
     """[E] options of each episode's reset."""
+    behaviours: Sequence[str] | None = None
+    """[E] name of the behaviour that chose each episode's actions."""
     env_spec: Any = None
     """`gymnasium.envs.registration.EnvSpec`, for `MinariDataset.recover_environment`."""
     metadata: dict[str, Any] | None = None
@@ -169,6 +172,8 @@ def _write_episodes(path: Path, store: FrameStore, extras: Extras) -> None:
                 group.attrs["seed"] = int(extras.seeds[episode])
             if extras.options is not None:
                 group.attrs.update({f"options/{name}": value for name, value in extras.options[episode].items()})
+            if extras.behaviours is not None:
+                group.attrs["behaviour"] = extras.behaviours[episode]
             frames = store.frames[rows]
             group.create_dataset("observations", data=frames, chunks=frames.shape, maxshape=(None, *frames.shape[1:]),
                                  compression="gzip", compression_opts=1)
@@ -207,7 +212,7 @@ def _write_minari(store: FrameStore, directory: Path, extras: Extras) -> None:
 
 
 def write_dataset(store: FrameStore, extras: Extras | None = None, overwrite: bool = False,
-                  finish: Callable[[Path], None] | None = None) -> Path:
+                  finish: Callable[[Path], object] | None = None) -> Path:
     """Write a store as the Minari dataset `store.dataset_id`: lossless HDF5, whole or not at all, checksums in its metadata.
 
     Args:

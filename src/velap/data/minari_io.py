@@ -106,7 +106,7 @@ def write_atomic(path: Path, content: bytes) -> None:
 
 def make_namespace(dataset_id: str) -> None:
     """Create the Minari namespace of `dataset_id` where it is missing."""
-    namespace = DATASET_ID_RE.fullmatch(dataset_id).group("namespace")  # type: ignore[union-attr]
+    namespace = DATASET_ID_RE.fullmatch(dataset_id).group("namespace")
     if namespace is not None and namespace not in list_local_namespaces():
         with contextlib.suppress(ValueError):  # another process was first
             create_namespace(namespace)

@@ -36,9 +36,14 @@ class Rows:
     length: np.ndarray
     """int64 [E] transitions of each episode."""
 
-    def arrays(self) -> tuple[np.ndarray, ...]:
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Those with one entry a frame, frames first."""
         return self.frames, self.actions, self.rewards, self.terminated, self.truncated
+
+    def head(self, count: int, length: np.ndarray) -> Rows:
+        """Views of the first `count` rows, with the episodes' lengths int64 [E]."""
+        return Rows(self.frames[:count], self.actions[:count], self.rewards[:count], self.terminated[:count],
+                    self.truncated[:count], length)
 
     def end(self) -> np.ndarray:
         """int64 [E] last row of each episode."""
@@ -167,7 +172,7 @@ def read_rows(dataset: MinariDataset, layout: ImageLayout, size: int | None) -> 
             getattr(rows, name)[start : start + steps] = episode[name]
         lengths.append(steps)
         start += steps + 1
-    return Rows(*(array[:start] for array in rows.arrays()), np.asarray(lengths, np.int64))
+    return rows.head(start, np.asarray(lengths, np.int64))
 
 
 def binarise(rows: Rows, dataset_id: str) -> Rows:
@@ -194,7 +199,7 @@ def binarise(rows: Rows, dataset_id: str) -> Rows:
     cut = int((lengths < rows.length).sum())
     if cut:
         notice(f"{dataset_id}: {cut} episodes go on after their first success; what follows it is left out.")
-    return Rows(*(array[:target] for array in rows.arrays()), lengths)
+    return rows.head(target, lengths)
 
 
 def check_ends(rows: Rows, dataset_id: str) -> None:

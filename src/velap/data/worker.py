@@ -67,7 +67,8 @@ def collect_shard(env: gym.Env, job: Job, name: str, context: int, first: int, c
     """Run `count` trajectories and write them as `name`, whole or not at all."""
     runs = [run_trajectory(env, job.recipe, job.shares, job.seed, context, first + number) for number in range(count)]
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **{key: np.concatenate([run[key] for run in runs]) for key in runs[0]})
+    arrays: dict[str, Any] = {key: np.concatenate([run[key] for run in runs]) for key in runs[0]}
+    np.savez_compressed(buffer, **arrays)
     write_atomic(job.shards / name, buffer.getvalue())
     return {"shard": name, "trajectories": count}
 
