@@ -96,7 +96,7 @@ def test_finds_the_way_round_a_wall_where_greedy_ascent_is_stuck() -> None:
 
 
 def assert_same_row(one: Plan, many: Plan, row: int) -> None:
-    """Every choice is the same; numbers may differ in the last bit, as vectorised arithmetic depends on the batch's shape."""
+    """Every choice is the same; numbers may differ in the last bit: vectorised arithmetic depends on shapes."""
     for name in ("waypoints", "length", "cost", "reached_goal", "nodes"):
         torch.testing.assert_close(getattr(one, name)[0], getattr(many, name)[row], rtol=0, atol=1e-12)
     for name in ("latents", "parents", "goal_values", "root_steps", "neighbour_counts", "size"):
