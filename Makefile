@@ -10,7 +10,6 @@ test: check
 check: setup
 	.venv/bin/ruff check .
 	.venv/bin/mypy
-	.venv/bin/lint-imports
 
 setup:
 	@bash scripts/setup.sh

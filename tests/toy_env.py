@@ -109,3 +109,6 @@ def toy_config(**planner: object) -> Config:
 def toy_env() -> gym.Env[Any, Any]:
     """The environment with a time limit of 60 steps."""
     return gym.wrappers.TimeLimit(ToyEnv(), 60)
+
+
+gym.register("Toy-v0", ToyEnv, max_episode_steps=60)

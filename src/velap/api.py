@@ -49,16 +49,22 @@ def run_dir(task: str, preset: str, seed: int) -> Path:
 
 
 def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwrite: bool = False) -> str:
-    """Collect the dataset of a task (Table 10) and return its Minari id.
+    """Collect the dataset of a task (Table 10), unless it is there already, and return its Minari id.
 
     Args:
         task: name from `velap.tasks.TASKS`.
-        seed: decides every array, whatever the number of workers.
+        seed: decides every array, whatever the number of workers; a dataset of another seed has to be overwritten.
         workers: processes; None takes one a core.
-        overwrite: replace a dataset of that id.
+        overwrite: collect again and replace a dataset of that id.
     """
+    from velap.data import minari_io
     from velap.data.collect import collect
 
+    dataset_id = get_task(task).dataset_id
+    if minari_io.exists(dataset_id) and not overwrite:
+        plan = minari_io.velap_metadata(minari_io.read_metadata(dataset_id)).get("plan", {})
+        if (plan.get("task"), plan.get("seed")) == (task, seed):
+            return dataset_id
     return collect(get_task(task), seed=seed, workers=workers, overwrite=overwrite).dataset_id
 
 
@@ -74,21 +80,34 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         out: run directory; None takes `runs/<task>/<preset>/seed<seed>`.
         image_key: key of the image in dict observations.
         device: `auto`, `cpu` or `cuda`.
-        resume: go on with an unfinished run in `out`.
+        resume: go on with the run in `out`; a finished one is left as it is.
         changes: config fields to replace.
         command: kept in the checkpoint as its origin.
         on_progress: called after every logged step.
     """
     from velap.data.episodes import load_store
+    from velap.training.loop import MODEL
     from velap.training.loop import train as run
 
     task = task_of(task_or_dataset)
     config = config_for(task, preset, changes)
     dataset_id = TASKS[task_or_dataset].dataset_id if task_or_dataset in TASKS else task_or_dataset
     store = load_store(dataset_id, image_key, min_length=config.train.dynamics_horizon)
-    result = run(config, store, out or run_dir(task, preset, seed), seed=seed, device=device, resume=resume, command=command,
-                 on_progress=on_progress)
+    directory = out or run_dir(task, preset, seed)
+    if resume and _is_finished(directory / MODEL, config, seed, store.content_hash):
+        return directory / MODEL
+    result = run(config, store, directory, seed=seed, device=device, resume=resume, command=command, on_progress=on_progress)
     return result.checkpoint
+
+
+def _is_finished(checkpoint: Path, config: Config, seed: int, dataset_hash: str) -> bool:
+    """Whether the checkpoint is there and is what this run would give; a resume then leaves it, and its records, alone."""
+    from velap.models.latent import load_checkpoint
+
+    if not checkpoint.exists():
+        return False
+    _, saved, metadata = load_checkpoint(checkpoint)
+    return saved == config and metadata["seed"] == str(seed) and metadata["dataset_hash"] == dataset_hash
 
 
 def load(checkpoint: Path | str, method: str = "velap", device: str = "auto") -> Agent:

@@ -14,6 +14,7 @@ import tyro
 from rich.console import Console
 from tyro.conf import Positional, arg
 
+from velap.config import Config
 from velap.errors import ConfigError, VelapError
 
 OUT = Console(highlight=False)
@@ -47,9 +48,9 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
                      command=_command())
     for note in result.notes:
         ERR.print(f"note: {note}", markup=False)
-    OUT.print(f"dataset {result.dataset_id} in {result.path}\n"
-              f"{result.episodes} episodes, {result.transitions} transitions, {result.successes} successful "
-              f"({result.success_percent:.3f} %), {result.seconds:.0f} s\ncontent hash {result.content_hash}", markup=False)
+    OUT.print(result.card, markup=False, soft_wrap=True)
+    OUT.print(f"dataset {result.dataset_id} in {result.path}, {result.seconds:.0f} s\n"
+              f"content hash {result.content_hash}", markup=False, soft_wrap=True)
 
 
 def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: str | None = None,
@@ -229,8 +230,18 @@ def parse_settings(settings: Sequence[str]) -> dict[str, dict[str, Any]]:
             value = ast.literal_eval(text)
         except (ValueError, SyntaxError):
             value = text
-        changes.setdefault(part, {})[field] = value
+        changes.setdefault(part, {})[field] = _as_type_of_default(part, field, value)
     return changes
+
+
+def _as_type_of_default(part: str, field: str, value: Any) -> Any:
+    """`value` in the type of the field's default; unknown fields pass, `override` names them."""
+    default = getattr(getattr(Config(task="", preset=""), part), field, None)
+    if isinstance(default, float) and isinstance(value, int):
+        return float(value)
+    if default is not None and type(value) is not type(default):
+        raise ConfigError(f"--set got {value!r} for {part}.{field}; expected {type(default).__name__}, such as {default!r}.")
+    return value
 
 
 def _command() -> str:

@@ -1,0 +1,202 @@
+"""The command line: exit codes, one-paragraph errors, resuming, foreign environments, the README's quickstart end to end."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import velap
+from velap import cli
+from velap.bench.records import read_records
+from velap.config import override
+from velap.errors import ConfigError
+from velap.models.latent import LatentModel, Spaces, save_checkpoint
+from velap.tasks import TASKS, make_config
+
+ROOT = Path(__file__).resolve().parents[1]
+RANDOM = ["evaluate", "SpiralMaze", "--method", "random", "--max-steps", "4"]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results, runs and datasets of these tests go into a temporary folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+
+
+def untrained(path: Path, task: str = "SpiralMaze", side: int = 64, bound: float = 1.0) -> Path:
+    """A checkpoint with random weights and a planner that is quick."""
+    config = override(make_config(task), planner={"n_iter": 4, "candidates": 2}, model={"bank_size": 16, "frame_stack": 1})
+    torch.manual_seed(0)
+    model = LatentModel(config.model, Spaces(side, side, (-bound,) * 2, (bound,) * 2), config.train.discount)
+    save_checkpoint(path, model, config, {"seed": "3"})
+    return path
+
+
+@pytest.mark.parametrize(("arguments", "text"), [
+    (["train", "Nowhere"], "unknown task 'Nowhere'; expected one of SpiralMaze"),
+    (["collect", "Nowhere"], "unknown task 'Nowhere'"),
+    (["run", "Nowhere"], "unknown task 'Nowhere'"),
+    (["demo", "Nowhere"], "unknown task 'Nowhere'"),
+    (["evaluate", "Nowhere"], "unknown task 'Nowhere'"),
+    (["evaluate", "SpiralMaze"], "name one with --checkpoint"),
+    (["evaluate", "SpiralMaze", "--checkpoint", "gone.safetensors"], "no checkpoint at gone.safetensors"),
+    (["evaluate", "x", "--method", "random", "--env", "NoSuch-v0"], "Gymnasium cannot make 'NoSuch-v0'"),
+    (["evaluate", "x", "--method", "random", "--env", "no_module:NoSuch-v0"], "no_module"),
+    (["evaluate", "x", "--method", "random", "--env", "CartPole-v1"], "Discrete(2)"),
+    (["evaluate", "SpiralMaze", "--method", "random", "--episodes", "0"], "got 0 episodes"),
+    (["train"], "`velap train TASK`"),
+    (["train", "SpiralMaze", "--dataset", "robot/pile-v0"], "expected one of them"),
+    (["train", "--dataset", "robot/pile-v0"], "no Minari dataset 'robot/pile-v0'"),
+    (["train", "SpiralMaze", "--set", "n_iter=3"], "expected PART.FIELD=VALUE"),
+    (["train", "SpiralMaze", "--set", "train.nothing=3"], "no field ['nothing']"),
+    (["train", "SpiralMaze", "--set", "train.window=x"], "'x' for train.window; expected int"),
+    (["table"], "no records below"),
+    (["table", "--records", "x", "--write", "README.md"], "no records below"),
+])
+def test_errors_are_one_paragraph_and_exit_2(arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(arguments) == 2
+    message = capsys.readouterr().err
+    assert text in message
+    assert message.startswith("velap: ")
+    assert message.count("\n") == 1, "one paragraph"
+    assert "Traceback" not in message
+    assert list(Path().rglob("*.jsonl")) == []
+
+
+@pytest.mark.parametrize("arguments", [
+    [], ["fly"], ["train", "SpiralMaze", "--sede", "1"], ["train", "SpiralMaze", "--preset", "best"],
+    ["evaluate", "SpiralMaze", "--method", "ppo"], ["evaluate", "SpiralMaze", "--episodes", "many"], ["evaluate"],
+])
+def test_wrong_options_exit_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(arguments)
+    assert exit_.value.code == 2
+    assert capsys.readouterr().err.strip()
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["--help"])
+    assert exit_.value.code == 0
+    text = capsys.readouterr().out
+    assert all(f"• {name}" in text for name in cli.COMMANDS)
+    assert set(cli.COMMANDS) == {"demo", "collect", "train", "evaluate", "run", "table", "bench", "info"}
+
+
+def test_ctrl_c_exits_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(cli.COMMANDS, "info", interrupted)
+    assert cli.main(["info"]) == 130
+
+
+def test_settings_take_the_type_of_their_field() -> None:
+    settings = ["planner.n_iter=500", "train.c1=1", "planner.anchor=snap", "planner.discard_low_exponent=20.0"]
+    assert cli.parse_settings(settings) == {
+        "planner": {"n_iter": 500, "anchor": "snap", "discard_low_exponent": 20.0}, "train": {"c1": 1.0}}
+    with pytest.raises(ConfigError, match=r"2\.5 for planner.n_iter; expected int, such as 250"):
+        cli.parse_settings(["planner.n_iter=2.5"])
+
+
+def test_an_evaluation_goes_on_where_it_stopped(capsys: pytest.CaptureFixture[str]) -> None:
+    path = Path("results/records/SpiralMaze/random-default/train0.jsonl")
+    assert cli.main([*RANDOM, "--episodes", "2"]) == 0
+    first = path.read_bytes()
+    assert cli.main([*RANDOM, "--episodes", "3", "--batch", "1"]) == 0
+    assert path.read_bytes().startswith(first)
+    records = read_records(path)
+    assert [(record.episode_seed, record.steps, record.truncated) for record in records] == [(s, 4, True) for s in range(3)]
+    assert "0.0 (0.0 to 56.1)" in capsys.readouterr().out
+    path.write_bytes(first[:-5])
+    assert cli.main([*RANDOM, "--episodes", "3"]) == 0
+    assert {record.episode_seed for record in read_records(path)} == {0, 1, 2}
+
+
+def test_a_table_is_written_into_the_readme(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*RANDOM, "--episodes", "1"]) == 0
+    Path("README.md").write_text((ROOT / "README.md").read_text())
+    assert cli.main(["table", "--write", "README.md"]) == 0
+    assert "| SpiralMaze | random | default | 0 | 1 | 0.0 (0.0 to 79.3) | - / 4.0 | - / - |" in Path("README.md").read_text()
+    assert cli.main(["table"]) == 0
+    assert "SpiralMaze" in capsys.readouterr().out
+
+
+def test_records_name_the_checkpoint_and_refuse_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", "SpiralMaze", "--episodes", "1", "--max-steps", "3", "--checkpoint"]
+    checkpoint = untrained(tmp_path / "a.safetensors")
+    assert cli.main([*command, str(checkpoint)]) == 0
+    path = Path("results/records/SpiralMaze/velap-default/train3.jsonl")
+    (record,) = read_records(path)
+    assert re.fullmatch("[0-9a-f]{64}", record.checkpoint)
+    assert re.fullmatch("[0-9a-f]{12}", record.config_hash)
+    assert record.code_version.startswith(velap.__version__)
+    assert len(record.plan_ms) == 1
+    assert cli.main([*command, str(checkpoint), "--set", "planner.n_iter=5"]) == 2
+    assert "`config_hash` is" in capsys.readouterr().err
+    assert cli.main([*command, str(checkpoint), "--set", "planner.n_iter=5", "--fresh"]) == 0
+    assert read_records(path)[0].config_hash != record.config_hash
+
+
+def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    foreign = untrained(tmp_path / "foreign.safetensors", task="robot")
+    assert cli.main(["evaluate", "SpiralMaze", "--checkpoint", str(foreign)]) == 2
+    assert "trained on 'robot', not on 'SpiralMaze'" in capsys.readouterr().err
+    wide = untrained(tmp_path / "wide.safetensors", bound=3.0)
+    assert cli.main(["evaluate", "SpiralMaze", "--checkpoint", str(wide)]) == 2
+    assert "the model acts in [-3.0, -3.0]" in capsys.readouterr().err
+
+
+def test_any_gymnasium_environment_and_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint = untrained(tmp_path / "toy.safetensors", task="toys")
+    command = ["evaluate", "toys", "--env", "toy_env:Toy-v0", "--checkpoint", str(checkpoint), "--episodes", "1"]
+    assert cli.main([*command, "--method", "td3bc", "--max-steps", "3", "--video"]) == 0
+    (path,) = Path("results/records").rglob("*.jsonl")
+    assert path.parts[2] == "toy_env_Toy-v0"
+    assert read_records(path)[0].env == "toy_env:Toy-v0"
+    assert Path("runs/videos/toy_env_Toy-v0/td3bc-default/train3/episode0.mp4").stat().st_size > 1000
+
+
+def test_info_names_tasks_and_versions(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["info"]) == 0
+    text = capsys.readouterr().out
+    assert "task SpiralMaze: environment velap/SpiralMaze-v0 (draws)" in text
+    assert f"torch {torch.__version__}" in text
+
+
+@pytest.fixture
+def small_spiral(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SpiralMaze with little data, little training and a planner that is quick."""
+    task = TASKS["SpiralMaze"]
+    small: dict[str, dict[str, Any]] = {
+        "train": {"joint_steps": 4, "latent_steps": 4, "batch_windows": 4, "latent_batch": 8, "log_every": 2,
+                  "diagnose_every": 4, "holdout_episodes": 2},
+        "planner": {"n_iter": 10, "candidates": 5}, "model": {"bank_size": 32}}
+    recipe = dataclasses.replace(task.recipe, trajectories=120)
+    monkeypatch.setitem(TASKS, "SpiralMaze", dataclasses.replace(task, recipe=recipe, default_overrides=small))
+
+
+@pytest.mark.usefixtures("small_spiral")
+def test_the_readme_quickstart_and_the_command_line_agree(capsys: pytest.CaptureFixture[str]) -> None:
+    (quickstart,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    frame_stack = make_config("SpiralMaze").model.frame_stack
+    names: dict[str, Any] = {"frames": np.zeros((2, frame_stack, 64, 64, 3), np.uint8)}
+    exec(quickstart.replace("episodes=100", "episodes=1"), names)
+    assert names["actions"].shape == (2, 2)
+    assert names["checkpoint"] == Path("runs/SpiralMaze/default/seed0/model.safetensors")
+    assert "Summary(task='SpiralMaze', method='velap', preset='default', train_seed=0, episodes=1" in capsys.readouterr().out
+
+    assert velap.make_dataset("SpiralMaze", seed=0) == names["dataset"], "there already"
+    records = Path("results/records/SpiralMaze/velap-default/train0.jsonl")
+    before = read_records(records)
+    assert cli.main(["run", "SpiralMaze", "--episodes", "1"]) == 0
+    assert read_records(records) == before, "the run is finished: nothing is left to do"
+    assert cli.main(["train", "SpiralMaze"]) == 2
+    assert "--resume" in capsys.readouterr().err
