@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from velap.data import behaviours, cards, collect, minari_io, pool
+from velap.data import behaviours, cards, collect, minari_io
 from velap.data.episodes import FrameStore, load_positions, load_store
 from velap.errors import DatasetError, RenderError, StorageError, UnknownTaskError
 from velap.tasks import Recipe, Task
@@ -116,7 +116,7 @@ def test_what_is_collected(root: Path):
     dataset = minari.load_dataset(result.dataset_id)
     assert dataset.env_spec.id == "velap_test/Line-v0"
     metadata = next(iter(dataset.storage.get_episode_metadata([0])))
-    assert (metadata["options"], metadata["behaviour"]) == ({"split": "train"}, "random-walk")
+    assert (metadata["options"], metadata["behaviour"]) == ({"split": "train", "context": 0}, "random-walk")
 
 
 def test_contexts_are_passed_on_and_counted():
@@ -241,6 +241,18 @@ def test_an_existing_dataset_is_replaced_only_on_request():
     assert a_store(second).content_hash == second.content_hash != first.content_hash
 
 
+def test_shards_left_beside_a_finished_dataset_are_deleted(root: Path, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(collect.shutil, "rmtree", lambda *args, **kwargs: None)
+        result = collect.collect(TASK, seed=3, workers=1)
+    partial = root / "velap" / ".Line-v0.partial"
+    assert list((partial / "shards").iterdir())
+    with pytest.raises(DatasetError, match="exists already"):
+        collect.collect(TASK, seed=3, workers=1)
+    assert not partial.exists()
+    assert a_store(result).content_hash == result.content_hash
+
+
 def test_unknown_task():
     with pytest.raises(UnknownTaskError, match="expected one of"):
         collect.collect("SpiralMase")
@@ -308,10 +320,3 @@ def test_the_card_of_a_strangers_dataset_needs_nothing_but_the_store(tmp_path: P
     paths = cards.save_card(store, tmp_path / "card")
     assert [path.name for path in paths] == ["card.md", "frames.png"]
     assert "Table 10" not in paths[0].read_text()
-
-
-def test_the_progress_bar_takes_counts(capsys: pytest.CaptureFixture[str]):
-    with pool.progress_bar("collecting") as progress:
-        progress(0, 10)
-        progress(10, 10)
-    assert "10/10" in capsys.readouterr().err

@@ -50,9 +50,9 @@ def mixture(task: str) -> dict[str, float]:
     return {name: share / total for name, share in shares.items()}
 
 
-def reset_options(recipe: Recipe, context: int) -> dict[str, Any]:
-    """Reset options of data collection; tasks with several contexts get the number of the context as well."""
-    return {"split": "train"} if recipe.contexts == 1 else {"split": "train", "context": context}
+def reset_options(context: int) -> dict[str, Any]:
+    """Reset options of data collection in the context of that number."""
+    return {"split": "train", "context": context}
 
 
 def position_of(env: gym.Env) -> np.ndarray:
@@ -77,7 +77,7 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
     rng = np.random.default_rng(policy_stream)
     names = sorted(shares)
     chosen = int(rng.choice(len(names), p=[shares[name] for name in names]))
-    frame, _ = env.reset(seed=reset_seed, options=reset_options(recipe, context))
+    frame, _ = env.reset(seed=reset_seed, options=reset_options(context))
     policy = BEHAVIOURS[names[chosen]](env, recipe, rng)
     frames, positions = [np.array(frame)], [position_of(env)]
     steps: list[tuple[np.ndarray, float, bool, bool]] = []

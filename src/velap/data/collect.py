@@ -113,23 +113,35 @@ def _assemble(directory: Path, shards: list[_Shard], description: dict[str, Any]
     return store, arrays
 
 
+def _saved_plan(work: Path) -> Any:
+    """What the shards in the work directory are of; None when there is no readable plan."""
+    try:
+        return json.loads((work / PLAN_FILE).read_bytes())
+    except (FileNotFoundError, ValueError):
+        return None
+
+
 def _prepare(work: Path, plan: dict[str, Any], resume: bool) -> tuple[str, ...]:
     """Make the work directory hold shards of `plan` only; returns notes about work that was discarded."""
-    path, shards, notes = work / PLAN_FILE, work / "shards", []
-    try:
-        before = json.loads(path.read_bytes()) if path.exists() else None
-    except ValueError:
-        before = None
-    if before != plan or not resume:
+    shards, notes = work / "shards", []
+    if _saved_plan(work) != plan or not resume:
         if shards.exists() and any(shards.iterdir()):
             reason = "they are of another seed, recipe, environment or renderer" if resume else "resume is off"
             notes.append(f"the unfinished trajectories of an earlier run were discarded: {reason}.")
         shutil.rmtree(shards, ignore_errors=True)
-        minari_io.write_atomic(path, json.dumps(plan, sort_keys=True).encode())
+        minari_io.write_atomic(work / PLAN_FILE, json.dumps(plan, sort_keys=True).encode())
     shards.mkdir(exist_ok=True)
     for leftover in shards.glob(".*.tmp"):
         leftover.unlink(missing_ok=True)
     return tuple(notes)
+
+
+def _forget_finished(work: Path, dataset_id: str) -> None:
+    """Delete the shards of a dataset that is there: its run was killed after the last rename."""
+    plan = _saved_plan(work)
+    if plan is not None and plan == minari_io.velap_metadata(minari_io.read_metadata(dataset_id)).get("plan"):
+        with minari_io.exclusive(work, dataset_id):
+            shutil.rmtree(work, ignore_errors=True)
 
 
 def _describe(running: list[Worker], env_id: str) -> dict[str, Any]:
@@ -153,7 +165,7 @@ def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, 
     extras = Extras(
         positions=positions,
         seeds=arrays["reset_seed"].tolist(),
-        options=[reset_options(recipe, int(context)) for context in arrays["context"]],
+        options=[reset_options(int(context)) for context in arrays["context"]],
         behaviours=[names[int(number)] for number in arrays["behaviour"]],
         env_spec=EnvSpec.from_json(description["env_spec"]) if description["env_spec"] else None,
         metadata={"algorithm_name": ", ".join(names), "author": {"velap"},
@@ -200,7 +212,7 @@ def collect(task: str | Task, seed: int = 0, workers: int | None = None, dataset
         dataset_id: Minari id; None takes the task's own.
         overwrite: replace a dataset of that id.
         resume: go on from the trajectories of an interrupted run of the same seed and recipe.
-        progress: called with (finished, all) trajectories, for example by `pool.progress_bar`.
+        progress: called with (finished, all) trajectories to move a progress bar.
         command: shell command to name on the card.
 
     Raises:
@@ -211,9 +223,11 @@ def collect(task: str | Task, seed: int = 0, workers: int | None = None, dataset
     dataset_id = dataset_id or task.dataset_id
     count = max(1, min(workers or len(os.sched_getaffinity(0)), len(_shards(task))))
     command = command or f"velap collect {task.name} --seed {seed}"
-    minari_io.refuse_existing(dataset_id, overwrite)
     work = minari_io.partial_path(dataset_id)
     try:
+        if minari_io.exists(dataset_id) and not overwrite:
+            _forget_finished(work, dataset_id)
+        minari_io.refuse_existing(dataset_id, overwrite)
         minari_io.make_namespace(dataset_id)
         with minari_io.exclusive(work, dataset_id):
             result = _collect(task, seed, count, dataset_id, resume, progress or (lambda done, total: None), command)

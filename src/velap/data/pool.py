@@ -109,17 +109,3 @@ def run_all(running: Sequence[Worker], requests: Sequence[dict[str, Any]], done:
                     key.data.ask(**queue.popleft())
                 else:
                     selector.unregister(key.fileobj)
-
-
-@contextmanager
-def progress_bar(label: str) -> Iterator[Progress]:
-    """A bar on the terminal's error stream with the time that is left; gives the callback that moves it."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    text = TextColumn("{task.description}")
-    columns = (text, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Bar(*columns, console=Console(stderr=True)) as bar:
-        item = bar.add_task(label, total=None)
-        yield lambda done, total: bar.update(item, completed=done, total=total)
