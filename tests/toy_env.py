@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from toy_world import GOAL, HALF_WIDTH, START, move, straight_to_goal, toy_fns
+from toy_world import GOAL, HALF_WIDTH, START, TIP, crosses_wall, move, straight_to_goal, toy_fns
 from velap.config import Config, override
 
 SIDE = 8
@@ -83,7 +83,9 @@ class ToyModel(nn.Module):
         return read(frames)
 
     def act_local(self, latent: Tensor, goal: Tensor) -> Tensor:
-        towards = goal - latent
+        """The shortest way: straight, or over the tip of the wall."""
+        over_the_tip = latent.new_tensor([0.0, TIP + 0.5])
+        towards = torch.where(crosses_wall(latent, goal)[..., None], over_the_tip, goal) - latent
         return towards / towards.norm(dim=-1, keepdim=True).clamp(min=1)
 
     def act_global(self, latent: Tensor) -> Tensor:
