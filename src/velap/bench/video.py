@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 TILE = 256
 """S [px]."""
+COLUMNS = 5
+"""Tiles side by side at most."""
 CAPTION = 32
 """Height of a tile's caption [px]; a multiple of 16, as video codecs want it."""
 FPS = 20
@@ -44,7 +46,7 @@ class VideoRecorder:
     def __init__(self, path: Path, tiles: int, latent_map: LatentMap | None = None) -> None:
         self.path = path
         self._map = latent_map
-        self._columns = min(tiles, max(1, math.ceil(math.sqrt(2 * tiles))))
+        self._columns = min(tiles, COLUMNS)
         rows = math.ceil(tiles / self._columns)
         self._canvas = np.full((rows * (TILE + CAPTION), self._columns * TILE, 3), 255, np.uint8)
         self._steps = [0] * tiles
