@@ -163,7 +163,7 @@ def test_behaviours_are_mixed_in_their_shares(monkeypatch: pytest.MonkeyPatch):
 
 def start(root: Path, delay: float) -> subprocess.Popen[bytes]:
     environment = {**os.environ, "LINE_DELAY": str(delay), "PYTHONPATH": os.pathsep.join(sys.path)}
-    return subprocess.Popen([sys.executable, "-c", SCRIPT], env=environment, stderr=subprocess.PIPE)
+    return subprocess.Popen([sys.executable, "-c", SCRIPT], env=environment, stderr=subprocess.PIPE, start_new_session=True)
 
 
 def wait_for(found, seconds: float = 30.0) -> None:
@@ -206,7 +206,7 @@ def test_workers_end_with_a_killed_parent(root: Path):
 def test_ctrl_c_is_clean(root: Path):
     process = start(root, delay=0.05)
     wait_for(lambda: list((root / "velap" / ".Line-v0.partial" / "shards").glob("0*.npz")))
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: parent and workers alike
     _, errors = process.communicate(timeout=20)
     assert process.returncode != 0
     assert errors.decode().strip().endswith("KeyboardInterrupt")

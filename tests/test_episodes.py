@@ -227,6 +227,15 @@ def test_arrays_are_checked_against_their_own_hash():
         load_store("velap/Toy-v0")
 
 
+def test_what_is_kept_beside_the_arrays_is_checked_too():
+    path = write_dataset(a_store(), Extras(positions=np.zeros((18, 2), np.float32))) / "data" / "main_data.hdf5"
+    with h5py.File(path, "r+") as file:
+        file["episode_2/infos/agent_position"][3, 0] = 0.25
+    for read in (load_positions, load_store):
+        with pytest.raises(DatasetError, match="damaged"):
+            read("velap/Toy-v0")
+
+
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"velap": 3}', '{"total_episodes": 1}'])
 def test_damaged_metadata(text: str):
     path = write_dataset(a_store()) / "data" / "metadata.json"
