@@ -60,6 +60,8 @@ class ModelConfig:
     """Critics end in a sigmoid: returns of a terminal 0/1 reward lie in [0, 1]. ours; off in `paper`."""
     n_ens: int = 3
     """Members of the local ensemble, Table 7."""
+    n_global: int = 2
+    """Members of the global critic, of which the minimum counts (TD3's two). ours; 1 in `paper`: Eq. 4 has no minimum."""
     latent_norm: bool = False
     """Latents are normalised to zero mean and unit variance over their dimensions. ours; off in `paper`."""
     bank_size: int = 4096
@@ -73,6 +75,7 @@ class ModelConfig:
         _require(len(sizes) == 1, "encoder_filters", self.encoder_filters, "as many filters as kernels and strides")
         _require(self.noise_dim >= 1, "noise_dim", self.noise_dim, "a positive number of units")
         _require(self.n_ens >= 1, "n_ens", self.n_ens, "at least one critic")
+        _require(self.n_global >= 1, "n_global", self.n_global, "at least one critic")
         _require(self.bank_size >= 0, "bank_size", self.bank_size, "0 or a number of latents")
 
 
@@ -331,6 +334,6 @@ PAPER_TRAIN: dict[str, Any] = {
     "window": 3,
     "whole_windows": False,
     "latent_steps": 0,
-    "joint_steps": 100_000,
+    "joint_steps": 12_000,
 }
 PAPER_PLANNER: dict[str, Any] = {"coherent_noise": False, "anchor": "none", "discard_low_exponent": None}

@@ -47,7 +47,7 @@ class LatentModel(nn.Module):
         self.local_policy = Policy(2 * latent, config.policy_dense, action, norm)
         self.global_policy = Policy(latent, config.policy_dense, action, norm)
         self.local_critics = EnsembleMLP(config.n_ens, 2 * latent + action, config.critic_dense, norm)
-        self.global_critic = EnsembleMLP(1, latent + action, config.critic_dense, norm)
+        self.global_critic = EnsembleMLP(config.n_global, latent + action, config.critic_dense, norm)
         if config.critic_bounded:
             for critic in (self.local_critics, self.global_critic):
                 nn.init.constant_(critic.biases[-1], UNREWARDED)
@@ -87,9 +87,13 @@ class LatentModel(nn.Module):
         """Q^l of every member: `[*, D], [*, D], [*, A] → [n, *]` [Q-value]."""
         return self.bound(self.local_critics(torch.cat([latent, goal, action], -1)))
 
+    def global_qs(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Q^g of every member: `[*, D], [*, A] → [members, *]` [Q-value]."""
+        return self.bound(self.global_critic(torch.cat([latent, action], -1)))
+
     def global_q(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Q^g: `[*, D], [*, A] → [*]` [Q-value]."""
-        return self.bound(self.global_critic(torch.cat([latent, action], -1)))[0]
+        """Q^g, the minimum over its members: `[*, D], [*, A] → [*]` [Q-value]."""
+        return self.global_qs(latent, action).amin(0)
 
     def reach(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Q_min and Q_std of §4 under π^l: `[*, D], [*, D] → [*], [*]` [Q-value]; population deviation over the members."""

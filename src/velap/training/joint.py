@@ -159,10 +159,10 @@ class JointLearner:
             action = model.act_local(then, there)
             next_local = model.bound(self.local_target(torch.cat([then, there, action], -1))).amin(0)
             local_goal = td_target(batch.goals.reward, batch.goals.proceeds, next_local, config.discount)
-            next_global = model.bound(self.global_target(torch.cat([then, model.act_global(then)], -1)))[0]
+            next_global = model.bound(self.global_target(torch.cat([then, model.act_global(then)], -1))).amin(0)
             global_goal = td_target(batch.reward, batch.proceeds, next_global, config.discount)
         local, local_info = critic_loss(model.local_q(now, goal, batch.action), local_goal, weight)
-        task, task_info = critic_loss(model.global_q(now, batch.action), global_goal, weight)
+        task, task_info = critic_loss(model.global_qs(now, batch.action), global_goal, weight)
         info = {
             "local/loss": local_info["loss"],
             "local/q": local_info["q"],
