@@ -92,6 +92,7 @@ def test_rows_replan_at_their_own_times() -> None:
     for _ in range(3):
         assert planned(agent, START, START) == []
     agent.reset(np.array([False, True]), np.array([0, 3]))
+    assert len(agent.waypoints_ahead(1)) == 0
     assert planned(agent, START, START) == [1]
     for _ in range(5):
         assert planned(agent, START, START) == []
