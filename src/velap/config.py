@@ -83,7 +83,7 @@ class ModelConfig:
 class TrainConfig:
     """Joint training (Eq. 2-5, 9; Table 7; App. B.4, B.5) and the latent phase (ours)."""
 
-    joint_steps: int = 10_000
+    joint_steps: int = 6_000
     """Model updates of the joint phase [steps]. ours: the paper gives no number."""
     batch_windows: int = 12
     """Windows of consecutive frames a batch. Table 7: 64 transitions, so 64 windows with `whole_windows` off."""
@@ -118,17 +118,18 @@ class TrainConfig:
     """Share of goals from the future of the same trajectory (strategy b). ours."""
     relabel_other: float = 0.4
     """Share of goals from other trajectories (strategy c). ours."""
-    rewarded_share: float = 0.0
-    """Share of windows drawn to hold a rewarded transition, beyond chance. ours."""
-    target_rate: float = 0.005
-    """Polyak rate of the target networks (TD3's value; the paper is silent)."""
-    policy_every: int = 1
-    """Model updates a policy update; 1 is the alternation of Eq. 2 and 5."""
-    latent_steps: int = 8_000
+    rewarded_share: float = 0.05
+    """Share of windows drawn to hold a rewarded transition, beyond chance. ours; 0 in `paper`."""
+    target_rate: float = 0.05
+    """Polyak rate of the target networks. ours: values of unreachable goals fall by γ a target update, so a slow one costs
+    thousands of updates; TD3's 0.005 in `paper`, which is silent."""
+    policy_every: int = 2
+    """Model updates a policy update. ours (TD3's delay); 1 in `paper`, the alternation of Eq. 2 and 5."""
+    latent_steps: int = 4_000
     """Updates of the latent phase: encoder frozen, all latents cached. ours; 0 in `paper`."""
     latent_batch: int = 256
     """Windows a batch of the latent phase. ours."""
-    latent_horizon: int = 10
+    latent_horizon: int = 5
     """Rollout length of the dynamics in the latent phase [steps]. ours."""
     latent_heads: bool = True
     """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
@@ -328,12 +329,21 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
     return dataclasses.replace(config, **parts)
 
 
-PAPER_MODEL: dict[str, Any] = {"norm": "batch", "dynamics_residual": False, "critic_bounded": False, "bank_size": 0}
+PAPER_MODEL: dict[str, Any] = {
+    "norm": "batch",
+    "dynamics_residual": False,
+    "critic_bounded": False,
+    "n_global": 1,
+    "bank_size": 0,
+}
 PAPER_TRAIN: dict[str, Any] = {
     "batch_windows": 64,
     "window": 3,
     "whole_windows": False,
     "latent_steps": 0,
+    "rewarded_share": 0.0,
+    "target_rate": 0.005,
+    "policy_every": 1,
     "joint_steps": 12_000,
 }
 PAPER_PLANNER: dict[str, Any] = {"coherent_noise": False, "anchor": "none", "discard_low_exponent": None}

@@ -59,7 +59,13 @@ TASKS: dict[str, Task] = {
             entry_point="velap.envs.block_maze:SpiralMaze",
             max_steps=300,
             recipe=Recipe(contexts=1, trajectories=1000, max_steps=20, success_percent=0.12),
-            overrides={"model": {"frame_stack": 1}, "train": {"c1": 0.001}, "planner": {"n_sim": 10}, "controller": {"n_replan": 25}},
+            overrides={
+                "model": {"frame_stack": 1},
+                "train": {"c1": 0.001},
+                "planner": {"n_sim": 10},
+                "controller": {"n_replan": 25},
+            },
+            default_overrides={"train": {"c1": 0.02}},
         ),
     )
 }
