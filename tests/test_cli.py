@@ -90,12 +90,13 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert set(cli.COMMANDS) == {"demo", "collect", "train", "evaluate", "run", "table", "bench", "info"}
 
 
-def test_ctrl_c_exits_130(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_exits_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupted() -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setitem(cli.COMMANDS, "info", interrupted)
     assert cli.main(["info"]) == 130
+    assert "goes on from here" in capsys.readouterr().err
 
 
 def test_settings_take_the_type_of_their_field() -> None:
@@ -152,6 +153,20 @@ def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path: Path, capsys: pytes
     wide = untrained(tmp_path / "wide.safetensors", bound=3.0)
     assert cli.main(["evaluate", "SpiralMaze", "--checkpoint", str(wide)]) == 2
     assert "the model acts in [-3.0, -3.0]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip"])
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path, damage: str, capsys: pytest.CaptureFixture[str]) -> None:
+    path = untrained(tmp_path / "model.safetensors")
+    content = bytearray(path.read_bytes())
+    if damage == "cut":
+        del content[-1000:]
+    else:
+        content[-1000] ^= 1
+    path.write_bytes(content)
+    assert cli.main(["evaluate", "SpiralMaze", "--checkpoint", str(path)]) == 2
+    assert "damaged" in capsys.readouterr().err
+    assert list(Path().rglob("*.jsonl")) == []
 
 
 def test_any_gymnasium_environment_and_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

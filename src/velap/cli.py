@@ -84,13 +84,9 @@ def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str
     from velap.bench.console import TrainView
 
     view = TrainView(OUT)
-    directory = out or api.run_dir(api.task_of(source), preset, seed)
     try:
-        return api.train(source, preset, seed, directory, image_key=image_key, device=device, resume=resume,
+        return api.train(source, preset, seed, out, image_key=image_key, device=device, resume=resume,
                          changes=parse_settings(settings), command=_command(), on_progress=view)
-    except KeyboardInterrupt:
-        ERR.print(f"stopped; the state is in {directory}, --resume goes on with it", markup=False)
-        raise
     finally:
         view.close()
 
@@ -191,15 +187,16 @@ def demo(task: Positional[str] = "SpiralMaze", checkpoint: Path | None = None, e
     run_demo(OUT, task, checkpoint, episodes, out, device)
 
 
-def bench(json: Path | None = None, device: Device = "auto") -> None:
+def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device = "auto") -> None:
     """Measure the speed ratios side by side and print them.
 
     Args:
         json: Write them to this file as well, such as results/bench/cpu.json.
+        only: Names of the benchmarks to measure, such as plan_latency_1; all unless said.
     """
     from velap.bench.speed import run_benchmarks
 
-    run_benchmarks(OUT, json, device)
+    run_benchmarks(OUT, json, device, only)
 
 
 def info() -> None:
@@ -265,5 +262,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ERR.print(f"velap: {error}", style="red", markup=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:
+        ERR.print("stopped; the same command goes on from here (`velap train` with --resume)", markup=False, soft_wrap=True)
         return 130
     return 0
