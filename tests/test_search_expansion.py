@@ -30,6 +30,7 @@ def test_thresholds_are_the_exponents_of_table_8() -> None:
 @pytest.mark.parametrize(("q", "std", "field"), [
     (DISCOUNT**5.01, 0.0, "low"), (DISCOUNT**4.99, 0.0, None), (DISCOUNT**4, 1.01 * (1 - DISCOUNT), "std"),
     (DISCOUNT**4, 0.99 * (1 - DISCOUNT), None), (DISCOUNT**1.99, 0.0, "high"), (DISCOUNT**2.01, 0.0, None),
+    (DISCOUNT**5.01, 1.0, "low"), (DISCOUNT**1.99, 1.0, "std"),
 ])
 def test_each_rejection_at_its_threshold(q: float, std: float, field: str | None) -> None:
     cfg = PlannerConfig(n_iter=1, n_sim=5, candidates=1)

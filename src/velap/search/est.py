@@ -31,7 +31,7 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
     tree = new_tree(z_root, fns.value(z_root), cfg.n_iter + 1)
     verdicts = []
     for start in range(0, cfg.n_iter, cfg.candidates):
-        part = noise.part(start, min(start + cfg.candidates, cfg.n_iter))
+        part = noise.part(start, start + cfg.candidates)
         verdicts.append(expand_(tree, fns, cfg, limits, part, slots=start + 1))
     tree = trimmed(tree)
     leaf, reached = choose_leaf(tree, limits.goal)

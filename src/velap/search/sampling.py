@@ -23,7 +23,7 @@ class Noise(NamedTuple):
     """[B, n, S, m] standard normal input of g; S is 1 where a simulation keeps its noise, else n_sim."""
 
     def part(self, start: int, stop: int) -> Noise:
-        """The numbers of the expansions start ... stop - 1."""
+        """The numbers of the expansions start ... stop - 1, as far as there are any."""
         return Noise(self.node[:, start:stop], self.policy[:, start:stop], self.action[:, start:stop])
 
 
