@@ -221,6 +221,9 @@ class PlannerConfig:
     """p^value of the node sampling mixture; the rest is uniform. ours."""
     temperature_sparse: float = 1.0
     """T_sparse of Eq. 6 [neighbours]. ours."""
+    expansion_weight: float = 0.0
+    """An expansion made from a node crowds it like this many neighbours in Eq. 6, so that a node whose surroundings are
+    explored is left alone. ours; 0 in `paper`."""
     temperature_value: float = 0.1
     """T_value of Eq. 7 [Q-value]. ours."""
     p_policy: float = 0.2
@@ -239,6 +242,7 @@ class PlannerConfig:
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("temperature_sparse", "temperature_value", "neighbour_distance_factor", "anchor_factor"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
+        _require(self.expansion_weight >= 0, "expansion_weight", self.expansion_weight, "a weight of 0 or more")
         for name in ("p_sparse", "p_value", "p_policy"):
             _require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
         _require(self.p_sparse + self.p_value <= 1 + 1e-9, "p_sparse + p_value", self.p_sparse + self.p_value, "at most 1")
@@ -346,4 +350,9 @@ PAPER_TRAIN: dict[str, Any] = {
     "policy_every": 1,
     "joint_steps": 12_000,
 }
-PAPER_PLANNER: dict[str, Any] = {"coherent_noise": False, "anchor": "none", "discard_low_exponent": None}
+PAPER_PLANNER: dict[str, Any] = {
+    "coherent_noise": False,
+    "expansion_weight": 0.0,
+    "anchor": "none",
+    "discard_low_exponent": None,
+}

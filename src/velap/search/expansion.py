@@ -161,8 +161,10 @@ def first_come(novel: Tensor, blocks: Tensor) -> Tensor:
 def expand_(tree: Tree, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, noise: Noise, slots: int) -> Verdict:
     """One round, in place, on a growing tree of which at most the first `slots` slots are in use."""
     used = torch.arange(slots, device=tree.size.device) < tree.size.unsqueeze(1)
-    distribution = node_distribution(tree.neighbour_counts[:, :slots], tree.goal_values[:, :slots], used, cfg)
+    crowding = tree.neighbour_counts[:, :slots] + cfg.expansion_weight * tree.expansions[:, :slots]
+    distribution = node_distribution(crowding, tree.goal_values[:, :slots], used, cfg)
     parents = sample_nodes(distribution, noise.node, tree.size)
+    tree.expansions.scatter_add_(1, parents, torch.ones_like(parents))
     z_parent = take(tree.latents, parents)
     z, supported = anchored(fns, simulate(fns, z_parent, noise, cfg), cfg)
     q_edge, std_edge = fns.reach(z_parent, z)

@@ -55,17 +55,17 @@ def _draw(draw: Callable[..., Tensor], shape: tuple[int, ...], like: Tensor, gen
     return torch.stack(drawn).to(like.device)
 
 
-def node_distribution(neighbour_counts: Tensor, goal_values: Tensor, used: Tensor, cfg: PlannerConfig) -> Tensor:
+def node_distribution(crowding: Tensor, goal_values: Tensor, used: Tensor, cfg: PlannerConfig) -> Tensor:
     """P_node [B, N]: p^sparse of Eq. 6, p^value of Eq. 7, the rest uniform; 0 on unused slots.
 
     Args:
-        neighbour_counts: [B, N] int64 n^neigh.
+        crowding: [B, N] n^neigh of Eq. 6, to which our presets add expansions made [neighbours].
         goal_values: [B, N] Q^g [Q-value], -inf on unused slots.
         used: [B, N] bool.
         cfg: the mixture and its temperatures.
     """
-    crowding = (neighbour_counts / -cfg.temperature_sparse).masked_fill_(~used, -torch.inf)
-    sparse = crowding.softmax(1, dtype=goal_values.dtype)
+    logits = (crowding / -cfg.temperature_sparse).masked_fill_(~used, -torch.inf)
+    sparse = logits.softmax(1, dtype=goal_values.dtype)
     value = (goal_values / cfg.temperature_value).softmax(1)
     mixture = cfg.p_sparse * sparse + cfg.p_value * value
     uniform_share = 1 - cfg.p_sparse - cfg.p_value

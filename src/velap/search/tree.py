@@ -46,6 +46,7 @@ def new_tree(z_root: Tensor, goal_value: Tensor, capacity: int) -> Tree:
         goal_values=z_root.new_full(slots, -torch.inf),
         root_steps=z_root.new_full(slots, torch.inf),
         neighbour_counts=torch.zeros(slots, dtype=torch.int64, device=z_root.device),
+        expansions=torch.zeros(slots, dtype=torch.int64, device=z_root.device),
         size=torch.ones(batch, dtype=torch.int64, device=z_root.device),
     )
     tree.latents[:, 0] = z_root

@@ -74,6 +74,8 @@ class Tree:
     """[B, N] sum of log_γ Q_min over the edges from the root (Eq. 8) [steps]."""
     neighbour_counts: Tensor
     """[B, N] int64 n^neigh, nodes within d_neigh that reach this one with Q_min > τ_neigh (Sec. 4, "Node sampling")."""
+    expansions: Tensor
+    """[B, N] int64 expansions made from the node so far, whatever became of them."""
     size: Tensor
     """[B] int64 nodes in use, at least 1."""
 
