@@ -48,17 +48,9 @@ class RunKey:
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(RunKey):
     """One episode."""
 
-    task: str
-    method: str
-    preset: str
-    train_seed: int
-    env: str
-    config_hash: str
-    checkpoint: str
-    code_version: str
     episode_seed: int
     success: bool
     steps: int
