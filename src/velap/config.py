@@ -83,7 +83,7 @@ class ModelConfig:
 class TrainConfig:
     """Joint training (Eq. 2-5, 9; Table 7; App. B.4, B.5) and the latent phase (ours)."""
 
-    joint_steps: int = 6_000
+    joint_steps: int = 4_000
     """Model updates of the joint phase [steps]. ours: the paper gives no number."""
     batch_windows: int = 12
     """Windows of consecutive frames a batch. Table 7: 64 transitions, so 64 windows with `whole_windows` off."""

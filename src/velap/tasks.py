@@ -65,7 +65,18 @@ TASKS: dict[str, Task] = {
                 "planner": {"n_sim": 10},
                 "controller": {"n_replan": 25},
             },
-            default_overrides={"train": {"c1": 0.02}},
+            default_overrides={
+                "train": {"c1": 0.02},
+                "planner": {
+                    "n_iter": 1000,
+                    "discard_low_exponent": 20.0,
+                    "p_sparse": 0.9,
+                    "p_value": 0.1,
+                    "p_policy": 0.1,
+                    "expansion_weight": 1.0,
+                    "anchor": "snap",
+                },
+            },
         ),
     )
 }
