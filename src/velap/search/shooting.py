@@ -104,9 +104,9 @@ def shoot(
 
 def follow_policy(fns: SearchFns, z: Tensor, cfg: MPPIConfig, generator: RowGenerator, count: int) -> Tensor:
     """Actions [B, count, H, A] of π^g with noise, rolled out by the dynamics from z [B, 1, D]."""
-    z = z.expand(-1, count, -1)
-    action_dim = fns.act_global(z[:, :0]).shape[-1]
+    action_dim = fns.act_global(z).shape[-1]
     noise = normal((count, cfg.horizon, action_dim), z, generator) * cfg.policy_std
+    z = z.expand(-1, count, -1)
     actions = []
     for step in range(cfg.horizon):
         actions.append((fns.act_global(z) + noise[:, :, step]).clamp_(-1, 1))
