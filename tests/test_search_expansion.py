@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from toy_world import DISCOUNT, SPEED, reach, roots, row_generators, toy_fns
 from velap.config import PlannerConfig
 from velap.errors import ConfigError
-from velap.search import expansion
+from velap.search import est, expansion
 from velap.search.est import plan
 from velap.search.expansion import expand_, first_come, simulate, thresholds
 from velap.search.sampling import Noise, draw_noise
@@ -137,7 +137,8 @@ def test_anchors_need_a_bank() -> None:
 
 def test_packing_changes_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
     packed = plan(toy_fns(), roots(3, spread=2.0), CONFIG, row_generators(3))
-    monkeypatch.setattr(expansion, "packs", lambda z: False)
+    for module in (expansion, est):
+        monkeypatch.setattr(module, "packs", lambda z: False)
     whole = plan(toy_fns(), roots(3, spread=2.0), CONFIG, row_generators(3))
     assert packed.tree.parents.tolist() == whole.tree.parents.tolist()
     assert packed.tree.neighbour_counts.tolist() == whole.tree.neighbour_counts.tolist()

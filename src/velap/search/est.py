@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from velap.config import PlannerConfig
-from velap.search.expansion import Thresholds, Verdict, expand_, thresholds
+from velap.search.expansion import Thresholds, Verdict, expand_, packs, thresholds
 from velap.search.sampling import draw_noise
 from velap.search.tree import new_tree, take, trace_back, trimmed
 from velap.search.types import Plan, Rejections, RowGenerator, SearchFns, Tree
@@ -32,7 +32,8 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
     verdicts = []
     for start in range(0, cfg.n_iter, cfg.candidates):
         part = noise.part(start, start + cfg.candidates)
-        verdicts.append(expand_(tree, fns, cfg, limits, part, slots=start + 1))
+        slots = int(tree.size.max()) if packs(z_root) else start + 1
+        verdicts.append(expand_(tree, fns, cfg, limits, part, slots))
     tree = trimmed(tree)
     leaf, reached = choose_leaf(tree, limits.goal)
     nodes, length = trace_back(tree.parents, leaf, depth=len(verdicts))
