@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -135,11 +138,19 @@ def test_anchors_need_a_bank() -> None:
         plan(toy_fns(), roots(1), PlannerConfig(anchor="snap"), row_generators(1))
 
 
-def test_packing_changes_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    packed = plan(toy_fns(), roots(3, spread=2.0), CONFIG, row_generators(3))
+def accept_all(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Every pair is 2.5 steps apart: all candidates enter, each next to all others within d_neigh."""
+    return torch.full_like(start[..., 0], DISCOUNT**2.5), torch.zeros_like(start[..., 0])
+
+
+@pytest.mark.parametrize("reach_fn", [reach, accept_all])
+def test_packing_changes_no_result(monkeypatch: pytest.MonkeyPatch, reach_fn: Callable[..., Any]) -> None:
+    cfg, fns = PlannerConfig(**{**CONFIG.__dict__, "candidates": 10}), toy_fns(reach=reach_fn)
+    packed = plan(fns, roots(3, spread=2.0), cfg, row_generators(3))
     for module in (expansion, est):
         monkeypatch.setattr(module, "packs", lambda z: False)
-    whole = plan(toy_fns(), roots(3, spread=2.0), CONFIG, row_generators(3))
+    whole = plan(fns, roots(3, spread=2.0), cfg, row_generators(3))
+    assert (packed.tree.size == 101).all() == (reach_fn is accept_all)
     assert packed.tree.parents.tolist() == whole.tree.parents.tolist()
     assert packed.tree.neighbour_counts.tolist() == whole.tree.neighbour_counts.tolist()
     torch.testing.assert_close(packed.tree.latents, whole.tree.latents, rtol=0, atol=1e-12)

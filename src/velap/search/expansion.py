@@ -2,7 +2,8 @@
 
 S = M + K: a candidate is compared with the M nearest nodes and with the K candidates of its round. Shapes are fixed and
 nothing is read back, with one exception: on a CPU (`packs`) the networks see only the rows that matter, trees are looked
-at as far as they are filled, and loops stop when they are done. That changes no result, costs nothing there, and saves most of the critics' work.
+at as far as they are filled, and loops stop when they are done. That changes no result, costs nothing there, and saves
+most of the critics' work.
 """
 
 from __future__ import annotations
