@@ -224,3 +224,29 @@ def test_state_holds_no_pickle(tmp_path):
     train(config(), make_store(), tmp_path, device="cpu")
     tensors, metadata = load_tensors(tmp_path / STATE)
     assert metadata["step"] == "12" and "generator" in tensors
+
+
+def test_schedule_may_change_until_the_latent_phase_begins(tmp_path):
+    run = trainer(tmp_path)
+    run.update()
+    run.save()
+    longer = trainer(tmp_path, joint_steps=8, latent_steps=2)
+    longer.resume()
+    assert longer.step == 1
+    for _ in range(7):
+        run.update()
+    run.save()
+    with pytest.raises(CheckpointError, match="schedule"):
+        longer.resume()
+
+
+def test_weights_hash_does_not_depend_on_how_long_training_took(tmp_path):
+    hashes = []
+    for name, seconds in (("a", 1.0), ("b", 2.0)):
+        run = trainer(tmp_path / name)
+        run.update()
+        run.seconds = seconds
+        run.finish(f"velap train {name}")
+        hashes.append(load_tensors(tmp_path / name / MODEL)[1])
+    assert hashes[0]["weights_sha256"] == hashes[1]["weights_sha256"]
+    assert hashes[0]["sha256"] != hashes[1]["sha256"]

@@ -1,4 +1,4 @@
-"""Named errors. Each says what was got, what was expected and what to do; the command line prints one paragraph and exits 2."""
+"""Named errors. Each says what was got, what was expected and what to do; the command line prints it and exits 2."""
 
 
 class VelapError(Exception):

@@ -67,7 +67,7 @@ def write_atomic(path: Path, content: bytes) -> None:
             os.close(folder)
 
 
-def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+def content_sha256(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
     """SHA-256 over names, types, shapes, bytes and metadata: safetensors itself loads flipped payload bits silently."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
@@ -81,7 +81,7 @@ def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
     """Atomic safetensors file whose metadata carries a SHA-256 of everything else; returns that hash."""
     plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    digest = _digest(plain, metadata)
+    digest = content_sha256(plain, metadata)
     write_atomic(path, save(plain, {**metadata, CHECKSUM: digest}))
     return digest
 
@@ -107,7 +107,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise CheckpointError(
             f"{path} carries no checksum; expected a file that velap wrote. Foreign weights are not loaded."
         )
-    if _digest(tensors, metadata) != metadata[CHECKSUM]:
+    if content_sha256(tensors, metadata) != metadata[CHECKSUM]:
         raise CheckpointError(
             f"{path} is damaged: its content does not match the SHA-256 it carries. Restore it from a copy, or train again."
         )

@@ -20,8 +20,7 @@ from velap.bench.rollout import Episode, FrameReader, Observer, Rollout, make_en
 from velap.config import Config
 from velap.data.images import IMAGE_SIZE
 from velap.errors import ConfigError, UnknownTaskError
-from velap.models.latent import LatentModel, load_checkpoint
-from velap.runs import CHECKSUM
+from velap.models.latent import WEIGHTS_SHA256, LatentModel, load_checkpoint
 from velap.tasks import TASKS, get_task, make_config
 
 BATCH = 10
@@ -105,7 +104,7 @@ def _load_model(what: Evaluation) -> tuple[LatentModel | None, Config, int, str]
         raise ConfigError(f"method {what.method!r} acts by a trained model and got none; name one with --checkpoint, or "
                           f"train one with `velap train {what.task}`.")
     model, config, metadata = load_checkpoint(what.checkpoint, pick_device(what.device))
-    return model, override(config, **(what.changes or {})), int(metadata.get("seed", 0)), metadata[CHECKSUM]
+    return model, override(config, **(what.changes or {})), int(metadata.get("seed", 0)), metadata[WEIGHTS_SHA256]
 
 
 def make_env(env_id: str) -> gym.Env[Any, Any]:

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from velap.config import Config, ModelConfig, Precision
 from velap.errors import CheckpointError, VelapError
 from velap.models.generative import ConditionalVAE
 from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
-from velap.runs import load_tensors, save_tensors
+from velap.runs import content_sha256, load_tensors, save_tensors
 
 UNREWARDED = -4.0
 """Initial logit of bounded critics: sparse returns start near 0; from a half they would take thousands of updates to
@@ -133,8 +134,8 @@ class LatentModel(nn.Module):
         """Environment actions `[*, A]` to [-1, 1]."""
         return ((action - self.action_low) / (self.action_high - self.action_low) * 2 - 1).clamp(-1, 1)
 
-    def search_fns(self, neighbour_distance_factor: float = 3.0):
-        """The callables that the search needs (`velap.search.types.SearchFns`); refuses a model in train mode."""
+    def search_fns(self, neighbour_distance_factor: float = 3.0) -> dict[str, Any]:
+        """The callables that the search needs (fields of `velap.search.types.SearchFns`); refuses a model in train mode."""
         if self.training:
             raise VelapError("the model is in train mode; expected eval mode for planning. Call model.eval() first.")
         step_distance = float(self.step_distance)
@@ -154,18 +155,22 @@ class LatentModel(nn.Module):
 
 
 MODEL_FORMAT = "velap-latent-model/1"
+WEIGHTS_SHA256 = "weights_sha256"
+"""Metadata key: hash of weights and config alone, the same for the same training however long it took."""
 
 
 def save_checkpoint(path: Path, model: LatentModel, config: Config, provenance: Mapping[str, str]) -> str:
     """One safetensors file with weights, config and provenance (command, seed, dataset hash); returns its SHA-256."""
+    weights = model.state_dict()
     metadata = {
         **provenance,
+        WEIGHTS_SHA256: content_sha256(weights, {"config": config.to_json()}),
         "format": MODEL_FORMAT,
         "config": config.to_json(),
         "spaces": json.dumps(dataclasses.asdict(model.spaces)),
         "code_version": __version__,
     }
-    return save_tensors(path, model.state_dict(), metadata)
+    return save_tensors(path, weights, metadata)
 
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tuple[LatentModel, Config, dict[str, str]]:

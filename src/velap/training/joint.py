@@ -73,13 +73,23 @@ class JointLearner:
         self.cache: Tensor | None = None
         self.updates = 0
         self._optimise(config.learning_rate, encoder=True)
-        targets, sources = [self.local_target, self.global_target], [model.local_critics, model.global_critic]
+        targets, sources = self.targets.values(), (model.local_critics, model.global_critic)
         self._target_pairs = (
             [p for m in targets for p in m.parameters()],
             [p for m in sources for p in m.parameters()],
             [b for m in targets for b in m.buffers()],
             [b for m in sources for b in m.buffers()],
         )
+
+    @property
+    def targets(self) -> dict[str, nn.Module]:
+        """Target critics by name."""
+        return {"local": self.local_target, "global": self.global_target}
+
+    @property
+    def optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Optimisers by name."""
+        return {"model": self.model_optimizer, "policy": self.policy_optimizer}
 
     def _optimise(self, learning_rate: float, encoder: bool) -> None:
         """Fresh optimisers; the encoder is left out in the latent phase."""
@@ -126,7 +136,7 @@ class JointLearner:
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """For the schedule of the latent phase."""
-        for optimizer in (self.model_optimizer, self.policy_optimizer):
+        for optimizer in self.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate
 

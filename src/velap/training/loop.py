@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -25,11 +25,12 @@ from torch import Tensor
 from velap.config import Config
 from velap.data.episodes import FrameStore
 from velap.data.windows import WindowSampler
-from velap.errors import CheckpointError, DatasetError, TrainingError
+from velap.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from velap.models.latent import LatentModel, Spaces, save_checkpoint
-from velap.runs import MetricsLog, load_tensors, make_generator, save_tensors, write_atomic
+from velap.runs import MetricsLog, make_generator, write_atomic
 from velap.training.diagnostics import diagnose, measure_latents
 from velap.training.joint import JointLearner
+from velap.training.state import SCHEDULE, load_state, save_state
 
 STATE, MODEL = "state.safetensors", "model.safetensors"
 
@@ -123,62 +124,29 @@ class Trainer:
 
     def save(self) -> None:
         """Everything a resume needs, in one atomic file."""
-        learner = self.learner
-        tensors = {f"model/{k}": v for k, v in self.model.state_dict().items()}
-        for name, module in (("local", learner.local_target), ("global", learner.global_target)):
-            tensors |= {f"target/{name}/{k}": v for k, v in module.state_dict().items()}
-        for name, optimizer in (("model", learner.model_optimizer), ("policy", learner.policy_optimizer)):
-            for index, state in optimizer.state_dict()["state"].items():
-                tensors |= {f"optimizer/{name}/{index}/{k}": torch.as_tensor(v) for k, v in state.items()}
-        tensors["generator"] = self.generator.get_state()
-        metadata = {
-            "format": "velap-training-state/1",
-            "config": self.config.to_json(),
-            "seed": str(self.seed),
-            "step": str(self.step),
-            "updates": str(learner.updates),
-            "seconds": repr(self.seconds),
-            "dataset": self.store.content_hash,
-            "latent_phase": str(int(learner.cache is not None)),
-        }
-        save_tensors(self.run_dir / STATE, tensors, metadata)
+        metadata = self._identity() | {"step": str(self.step), "seconds": repr(self.seconds)}
+        save_state(self.run_dir / STATE, self.learner, metadata)
 
     def resume(self) -> None:
         """Continue from `state.safetensors`; raises CheckpointError when it belongs to another run."""
-        path = self.run_dir / STATE
-        tensors, metadata = load_tensors(path)
-        expected = {"config": self.config.to_json(), "seed": str(self.seed), "dataset": self.store.content_hash}
-        for key, value in expected.items():
-            if metadata.get(key) != value:
-                got = metadata.get(key, "nothing")
-                raise CheckpointError(
-                    f"{path} was made with another {key} ({got[:120]}…; this command has {value[:120]}…). "
-                    "Resume with the same task, preset, seed and dataset, or start a new run elsewhere."
-                )
-        learner = self.learner
-        self.model.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model/")})
-        if metadata["latent_phase"] == "1":
-            learner.begin_latent_phase()
-        for name, module in (("local", learner.local_target), ("global", learner.global_target)):
-            prefix = f"target/{name}/"
-            module.load_state_dict({k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)})
-        for name, optimizer in (("model", learner.model_optimizer), ("policy", learner.policy_optimizer)):
-            parameters = optimizer.param_groups[0]["params"]
-            state: dict[int, dict[str, Tensor]] = {}
-            for key, value in tensors.items():
-                if key.startswith(f"optimizer/{name}/"):
-                    _, _, index, field = key.split("/")
-                    # Same strides as the parameter (convolutions are channels_last): the fused update walks memory.
-                    like = parameters[int(index)]
-                    kept = torch.empty_like(like).copy_(value) if value.shape == like.shape else value
-                    state.setdefault(int(index), {})[field] = kept
-            optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-        self.generator.set_state(tensors["generator"])
-        self.step, learner.updates, self.seconds = (
-            int(metadata["step"]),
-            int(metadata["updates"]),
-            float(metadata["seconds"]),
-        )
+        metadata = load_state(self.run_dir / STATE, self.learner, self._identity())
+        self.step, self.seconds = int(metadata["step"]), float(metadata["seconds"])
+
+    def _identity(self) -> dict[str, str]:
+        """What must agree for a resume: everything that has had an effect on training so far.
+
+        Planner and controller never have. How long the joint phase lasts and what the latent phase does count once the
+        latent phase has begun (`schedule`).
+        """
+        train = asdict(self.config.train)
+        schedule = {name: train.pop(name) for name in sorted(train) if name == "joint_steps" or name.startswith("latent_")}
+        learned = {"task": self.config.task, "model": asdict(self.config.model), "train": train}
+        return {
+            "config": json.dumps(learned, sort_keys=True),
+            SCHEDULE: json.dumps(schedule),
+            "seed": str(self.seed),
+            "dataset": self.store.content_hash,
+        }
 
     def finish(self, command: str) -> TrainResult:
         """Measure the latents, keep the bank, write the released form of the model."""
@@ -269,8 +237,16 @@ def keep_freed_memory() -> None:
 
 
 def pick_device(device: str) -> torch.device:
-    """`auto` takes CUDA where it is found, else the CPU."""
-    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
+    """`auto` takes CUDA where it is found, else the CPU; raises ConfigError for a device that is not here."""
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        found = torch.device(device)
+    except RuntimeError as error:
+        raise ConfigError(f"unknown device {device!r}; expected auto, cpu or cuda.") from error
+    if found.type == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(f"device {device!r} was asked for and PyTorch finds no CUDA here. Use --device auto or cpu.")
+    return found
 
 
 def _run(trainer: Trainer, log: MetricsLog, on_progress: Callable[[Progress], None], interrupted: threading.Event) -> None:

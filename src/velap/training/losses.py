@@ -6,6 +6,8 @@ Letters: T transitions, n ensemble members, k rollout steps, W rollouts, C candi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -85,6 +87,6 @@ def reparameterise(mean: Tensor, log_variance: Tensor, noise: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def polyak(targets: list[Tensor], sources: list[Tensor], rate: float) -> None:
+def polyak(targets: Sequence[Tensor], sources: Sequence[Tensor], rate: float) -> None:
     """targets ← (1 - rate) · targets + rate · sources, in place."""
-    torch._foreach_lerp_(targets, sources, rate)
+    torch._foreach_lerp_(list(targets), list(sources), rate)
