@@ -19,10 +19,11 @@ def reference_plan(fns: SearchFns, root: torch.Tensor, cfg: PlannerConfig, noise
     gamma, low = fns.discount, cfg.n_sim if cfg.discard_low_exponent is None else cfg.discard_low_exponent
     tau_std = 1 - gamma if cfg.discard_std is None else cfg.discard_std
     q_min = lambda start, end: float(fns.reach(start, end)[0])  # noqa: E731
-    nodes, parents, values, steps, counts = [root], [-1], [float(fns.value(root))], [0.0], [0]
+    nodes, parents, values, steps, counts, expansions = [root], [-1], [float(fns.value(root))], [0.0], [0], [0]
     for i in range(cfg.n_iter):
         if i % cfg.candidates == 0:
-            sparse = [math.exp(-n / cfg.temperature_sparse) for n in counts]
+            crowding = [n + cfg.expansion_weight * e for n, e in zip(counts, expansions, strict=True)]
+            sparse = [math.exp(-n / cfg.temperature_sparse) for n in crowding]
             value = [math.exp(q / cfg.temperature_value) for q in values]
             uniform = 1 - cfg.p_sparse - cfg.p_value
             weights = [cfg.p_sparse * s / sum(sparse) + cfg.p_value * v / sum(value) + uniform / len(nodes)
@@ -30,6 +31,7 @@ def reference_plan(fns: SearchFns, root: torch.Tensor, cfg: PlannerConfig, noise
         target, exp = float(noise.node[0, i]) * sum(weights), 0
         while exp < len(weights) - 1 and sum(weights[: exp + 1]) <= target:
             exp += 1
+        expansions[exp] += 1
         new = nodes[exp]
         for step in range(cfg.n_sim):
             by_policy = float(noise.policy[0, i]) < cfg.p_policy
@@ -46,6 +48,7 @@ def reference_plan(fns: SearchFns, root: torch.Tensor, cfg: PlannerConfig, noise
         counts.append(sum(q_min(nodes[j], new) > gamma**cfg.neighbour_exponent for j in near))
         nodes.append(new)
         parents.append(exp)
+        expansions.append(0)
         values.append(float(fns.value(new)))
         steps.append(steps[exp] + math.log(edge) / math.log(gamma))
     goals = [i for i, q in enumerate(values) if q > gamma**cfg.goal_exponent]
@@ -54,4 +57,4 @@ def reference_plan(fns: SearchFns, root: torch.Tensor, cfg: PlannerConfig, noise
     while path[-1]:
         path.append(parents[path[-1]])
     return {"nodes": nodes, "parents": parents, "values": values, "steps": steps, "counts": counts, "path": path[::-1],
-            "goals": goals}
+            "goals": goals, "expansions": expansions}

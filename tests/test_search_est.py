@@ -45,6 +45,7 @@ def test_equals_plain_python_algorithm_1(seed: int, candidates: int) -> None:
     cfg = PlannerConfig(
         n_iter=100, n_sim=4 if coherent else 10, candidates=candidates, p_policy=0.3, coherent_noise=coherent,
         discard_low_exponent=6.0 if coherent else None, max_neighbours=101, goal_exponent=5.0 + 6 * (seed > 2),
+        expansion_weight=0.5 * (seed in (2, 3, 6)),
     )
     fns, z_root = toy_fns(reach=doubtful_reach, step=through_walls), roots(1, spread=1.0, seed=seed)
     found = plan(fns, z_root, cfg, torch.Generator().manual_seed(seed))
@@ -56,6 +57,7 @@ def test_equals_plain_python_algorithm_1(seed: int, candidates: int) -> None:
     assert found.tree.size.tolist() == [size]
     assert found.tree.parents[0, :size].tolist() == expected["parents"]
     assert found.tree.neighbour_counts[0, :size].tolist() == expected["counts"]
+    assert found.tree.expansions[0, :size].tolist() == expected["expansions"]
     torch.testing.assert_close(found.tree.latents[0, :size], torch.stack(expected["nodes"]), rtol=0, atol=1e-12)
     torch.testing.assert_close(found.tree.root_steps[0, :size].tolist(), expected["steps"])
     torch.testing.assert_close(found.tree.goal_values[0, :size].tolist(), expected["values"])
