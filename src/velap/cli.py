@@ -199,6 +199,20 @@ def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device =
     run_benchmarks(OUT, json, device, only)
 
 
+def study(subject: Annotated[Positional[Literal["faults"]], arg(help="`faults`: kills, damage, full disks.")],
+          quick: bool = False, seed: int = 0, write: Path | None = None) -> None:
+    """Try what may go wrong, on a task shrunk to seconds, and report what came of it.
+
+    Args:
+        quick: Two kills a command instead of twenty.
+        seed: Decides the moments of the kills.
+        write: Document to write, such as docs/faults.md.
+    """
+    from velap.bench.study import study_faults
+
+    study_faults(OUT, quick, seed, write)
+
+
 def info() -> None:
     """Versions, tasks and what this machine offers."""
     from velap.bench.info import describe
@@ -208,7 +222,7 @@ def info() -> None:
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": demo, "collect": collect, "train": train, "evaluate": evaluate, "run": run, "table": table, "bench": bench,
-    "info": info,
+    "study": study, "info": info,
 }
 
 
