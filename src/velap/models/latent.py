@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from velap._version import __version__
 from velap.config import Config, ModelConfig, Precision
 from velap.errors import CheckpointError, VelapError
 from velap.models.generative import ConditionalVAE
+from velap.models.inference import fast_ensemble, fast_mlp, nearest_row
 from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
 from velap.runs import content_sha256, load_tensors, save_tensors
 
@@ -113,8 +114,7 @@ class LatentModel(nn.Module):
 
     def nearest_bank(self, latent: Tensor) -> Tensor:
         """Index of the nearest bank latent: `[*, D] → [*]`."""
-        squares = self.bank_latents.square().sum(-1)
-        return (squares - 2 * latent @ self.bank_latents.T).argmin(-1)
+        return nearest_row(self.bank_latents)(latent)
 
     def bound(self, raw: Tensor) -> Tensor:
         """Critic output as a Q-value: a sigmoid when the config bounds it to [0, 1]."""
@@ -135,23 +135,60 @@ class LatentModel(nn.Module):
         return ((action - self.action_low) / (self.action_high - self.action_low) * 2 - 1).clamp(-1, 1)
 
     def search_fns(self, neighbour_distance_factor: float = 3.0) -> dict[str, Any]:
-        """The callables that the search needs (fields of `velap.search.types.SearchFns`); refuses a model in train mode."""
+        """The callables that the search needs (fields of `velap.search.types.SearchFns`), equal to the methods above but
+        without the module machinery; refuses a model in train mode. Build them anew after loading weights."""
         if self.training:
             raise VelapError("the model is in train mode; expected eval mode for planning. Call model.eval() first.")
         step_distance = float(self.step_distance)
         return {
-            "propose": self.propose,
-            "act_global": self.act_global,
-            "step": self.step,
-            "reach": self.reach,
-            "value": self.value,
-            "project": self.project if self.config.bank_size else None,
-            "q": self.global_q,
+            **self._fast_functions(),
+            "project": self._fast_project() if self.config.bank_size else None,
             "noise_dim": self.config.noise_dim,
             "discount": self.discount,
             "d_neigh": neighbour_distance_factor * step_distance,
             "step_distance": step_distance,
         }
+
+    def _fast_functions(self) -> dict[str, Callable[..., Any]]:
+        """h, g, π^g, Q^l and Q^g as the search calls them."""
+        dynamics, decoder = fast_mlp(self.dynamics), fast_mlp(self.action_model.decoder)
+        local_policy, global_policy = fast_mlp(self.local_policy), fast_mlp(self.global_policy)
+        local_critics, global_critic = fast_ensemble(self.local_critics), fast_ensemble(self.global_critic)
+        residual, bound = self.config.dynamics_residual, self.bound
+
+        def step(latent: Tensor, action: Tensor) -> Tensor:
+            change = dynamics(torch.cat([latent, action], -1))
+            return change.add_(latent) if residual else change
+
+        def act_global(latent: Tensor) -> Tensor:
+            return global_policy(latent).tanh_()
+
+        def reach(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+            ends = torch.cat([start, goal], -1)
+            q = bound(local_critics(torch.cat([ends, local_policy(ends).tanh_()], -1)))
+            return q.amin(0), q.std(0, correction=0)
+
+        def global_q(latent: Tensor, action: Tensor) -> Tensor:
+            return bound(global_critic(torch.cat([latent, action], -1))).amin(0)
+
+        return {
+            "propose": lambda latent, noise: decoder(torch.cat([latent, noise], -1)).tanh_(),
+            "act_global": act_global,
+            "step": step,
+            "reach": reach,
+            "q": global_q,
+            "value": lambda latent: global_q(latent, act_global(latent)),
+        }
+
+    def _fast_project(self) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+        """`project` with the bank's norms computed once."""
+        nearest, bank = nearest_row(self.bank_latents), self.bank_latents
+
+        def project(latent: Tensor) -> tuple[Tensor, Tensor]:
+            found = bank[nearest(latent)]
+            return found, (found - latent).norm(dim=-1)
+
+        return project
 
 
 MODEL_FORMAT = "velap-latent-model/1"

@@ -1,0 +1,114 @@
+"""The Eq. 1 bundle: shapes for any prefix, action scaling, the bank, and the functions that the search is given."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from velap.config import ModelConfig
+from velap.errors import VelapError
+from velap.models.latent import LatentModel, Spaces
+
+SMALL = ModelConfig(
+    frame_stack=2,
+    latent_dim=5,
+    encoder_filters=(4, 4),
+    encoder_kernels=(4, 4),
+    encoder_strides=(2, 2),
+    encoder_dense=(8,),
+    dynamics_dense=(16, 16),
+    generative_dense=(16,),
+    noise_dim=2,
+    policy_dense=(16,),
+    critic_dense=(16, 16),
+    bank_size=10,
+)
+
+
+def make_model(**changes) -> LatentModel:
+    torch.manual_seed(0)
+    model = LatentModel(dataclasses.replace(SMALL, **changes), Spaces(16, 16, (-2.0, 0.0), (2.0, 1.0)), 0.96)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+        model.bank_latents.normal_()
+        model.step_distance.fill_(0.5)
+        for buffer in model.buffers():
+            if buffer.dtype == torch.float32 and buffer.dim() == 1 and len(buffer) > 2:
+                buffer.uniform_(0.5, 1.5)
+    return model.eval().requires_grad_(False)
+
+
+@pytest.mark.parametrize("prefix", [(), (3,), (2, 3)])
+@pytest.mark.parametrize(
+    "changes", [{}, {"norm": "batch"}, {"norm": "none"}, {"critic_bounded": False, "dynamics_residual": False}]
+)
+def test_search_functions_equal_the_model(prefix, changes):
+    model = make_model(**changes)
+    fns = model.search_fns(2.0)
+    z, goal = torch.randn(*prefix, 5), torch.randn(*prefix, 5)
+    action, noise = torch.rand(*prefix, 2) * 2 - 1, torch.randn(*prefix, 2)
+    pairs = [
+        (fns["propose"](z, noise), model.propose(z, noise)),
+        (fns["act_global"](z), model.act_global(z)),
+        (fns["step"](z, action), model.step(z, action)),
+        (fns["q"](z, action), model.global_q(z, action)),
+        (fns["value"](z), model.value(z)),
+        *zip(fns["reach"](z, goal), model.reach(z, goal), strict=True),
+        *zip(fns["project"](z), model.project(z), strict=True),
+    ]
+    for got, expected in pairs:
+        torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+    assert fns["d_neigh"] == 1.0
+    assert fns["step_distance"] == 0.5
+
+
+def test_train_mode_is_refused():
+    model = make_model().train()
+    with pytest.raises(VelapError, match="train mode"):
+        model.search_fns()
+
+
+def test_reach_is_minimum_and_deviation_over_the_members():
+    model = make_model()
+    z, goal = torch.randn(4, 5), torch.randn(4, 5)
+    q = model.local_q(z, goal, model.act_local(z, goal))
+    assert q.shape == (3, 4)
+    q_min, q_std = model.reach(z, goal)
+    torch.testing.assert_close(q_min, q.min(0).values)
+    torch.testing.assert_close(q_std, ((q - q.mean(0)) ** 2).mean(0).sqrt())
+
+
+def test_bounded_critics_lie_in_the_unit_interval_and_start_near_zero():
+    torch.manual_seed(0)
+    model = LatentModel(SMALL, Spaces(16, 16, (-1.0,), (1.0,)), 0.96).eval()
+    q = model.global_q(torch.randn(100, 5), torch.rand(100, 1))
+    assert q.min() > 0
+    assert q.max() < 0.2
+
+
+def test_actions_scale_to_the_environment_and_back():
+    model = make_model()
+    np.testing.assert_allclose(model.to_env(torch.tensor([[-1.0, 0.0], [3.0, 1.0]])), [[-2.0, 0.5], [2.0, 1.0]])
+    torch.testing.assert_close(model.to_unit(torch.tensor([1.0, 0.25])), torch.tensor([0.5, -0.5]))
+
+
+def test_project_finds_the_nearest_bank_latent():
+    model = make_model()
+    z = torch.randn(20, 5)
+    found, distance = model.project(z)
+    every = torch.cdist(z, model.bank_latents)
+    torch.testing.assert_close(distance, every.min(1).values)
+    torch.testing.assert_close(found, model.bank_latents[every.argmin(1)])
+
+
+def test_encode_takes_any_prefix_and_reads_every_frame_of_the_stack():
+    model = make_model()
+    frames = torch.randint(0, 255, (2, 3, 2, 16, 16, 3), dtype=torch.uint8)
+    latents = model.encode(frames)
+    assert latents.shape == (2, 3, 5)
+    torch.testing.assert_close(model.encode(frames[1, 2]), latents[1, 2])
+    changed = frames.clone()
+    changed[..., 0, :, :, :] = 0
+    assert (model.encode(changed) - latents).abs().max() > 1e-4
