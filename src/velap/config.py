@@ -348,7 +348,7 @@ PAPER_TRAIN: dict[str, Any] = {
     "rewarded_share": 0.0,
     "target_rate": 0.005,
     "policy_every": 1,
-    "joint_steps": 12_000,
+    "joint_steps": 8_000,
 }
 PAPER_PLANNER: dict[str, Any] = {
     "coherent_noise": False,
