@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
@@ -25,8 +25,16 @@ EVALUATE = ("evaluate", "SpiralMaze", "--episodes", "1", "--checkpoint", "run/mo
 
 Outcome = tuple[int, str]
 """Exit code and stderr of a command."""
-Run = Callable[[Sequence[str], Path], Outcome]
-"""Runs `velap arguments` in a folder whose `datasets` is Minari's root."""
+
+
+class Run(Protocol):
+    """Runs `velap arguments`."""
+
+    def __call__(self, arguments: Sequence[str], place: Path, datasets: str = "datasets",
+                 limit: int | None = None) -> Outcome:
+        """In the folder `place`, with Minari's root `datasets` in it; no file may grow beyond `limit` [bytes]."""
+        ...
+
 
 
 @dataclass(frozen=True)

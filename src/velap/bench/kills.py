@@ -28,8 +28,8 @@ from velap.tasks import TASKS
 
 TASK = "SpiralMaze"
 SMALL = {
-    "train": {"joint_steps": 24, "latent_steps": 24, "batch_windows": 4, "latent_batch": 8, "log_every": 2,
-              "diagnose_every": 12, "checkpoint_every": 2, "holdout_episodes": 2},
+    "train": {"joint_steps": 12, "latent_steps": 12, "batch_windows": 4, "latent_batch": 8, "log_every": 2,
+              "diagnose_every": 6, "checkpoint_every": 2, "holdout_episodes": 2},
     "planner": {"n_iter": 10, "candidates": 5}, "model": {"bank_size": 32},
 }
 """Config fields of the shrunk task. ours: a run of seconds that checkpoints every other step, in both phases."""
@@ -186,7 +186,7 @@ def kill_and_resume(victim: Victim, folder: Path, kills: int, rng: np.random.Gen
     for number in range(kills):
         place = folder / f"kill{number}"
         place.mkdir(parents=True)
-        finished += _start_and_kill(victim, place, number % 2 == 1, seconds, rng)
+        finished += _start_and_kill(victim, place, number % 2 == 0, seconds, rng)
         problems += [f"after kill {number}: {problem}" for problem in unreadable(place)]
         again = victim.go_on(place)
         _, errors = again.communicate()

@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from velap.bench.console import View
-from velap.bench.faults import CASES, DATASET, Finding, check, judge, message_of, shown
+from velap.bench.faults import CASES, DATASET, Finding, Outcome, Run, check, judge, message_of, shown
 from velap.bench.kills import (
     FILE_LIMIT,
     SMALL,
@@ -65,21 +65,21 @@ DISK_CASES = (
 
 
 @contextmanager
-def full_disk(folder: Path, free: int, mount: bool = True) -> Iterator[dict[str, str]]:
+def full_disk(folder: Path, free: int, mount: bool = True) -> Iterator[int | None]:
     """Make `folder` a file system with `free` bytes of room; where it cannot be mounted, a limit on files stands in.
 
-    Yields environment variables for `start`. What was written stays in `folder` when the block is left, with room again.
+    Yields that limit [bytes]. What was written stays in `folder` when the block is left, with room again.
     """
     folder.mkdir(parents=True)
     command = ["mount", "-t", "tmpfs", "-o", f"size={DISK}", "tmpfs", str(folder)]
     if not (mount and os.geteuid() == 0 and subprocess.run(command, capture_output=True).returncode == 0):
-        yield {FILE_LIMIT: str(free)}
+        yield free
         return
     kept = folder.with_name("kept")
     try:
         filler = folder / "filler"
         filler.write_bytes(bytes(shutil.disk_usage(folder).free - free))
-        yield {}
+        yield None
         filler.unlink()
         shutil.copytree(folder, kept)
     finally:
@@ -87,31 +87,29 @@ def full_disk(folder: Path, free: int, mount: bool = True) -> Iterator[dict[str,
     shutil.copytree(kept, folder, dirs_exist_ok=True)
 
 
-def check_disk(case: DiskCase, base: Path, place: Path, mount: bool = True) -> Finding:
+def check_disk(case: DiskCase, base: Path, place: Path, run: Run, mount: bool = True) -> Finding:
     """Run a command onto a full disk, judge what it says and leaves, and let it go on with room."""
     shutil.copytree(base, place)
     disk = place / "disk"
-    with full_disk(disk, case.free, mount) as extra:
-        process = start(case.arguments, place, place / case.datasets, **extra)
-        _, stderr = process.communicate()
-        problems = judge(process.returncode, stderr, "")
+    with full_disk(disk, case.free, mount) as limit:
+        code, stderr = run(case.arguments, place, case.datasets, limit)
+        problems = judge(code, stderr, "")
         problems += unreadable(disk) + [left for left in leftovers(disk) if ".tmp" in left]
-    again = start(case.again, place, place / case.datasets)
-    _, errors = again.communicate()
-    if again.returncode:
-        problems.append(f"with room it ends with code {again.returncode}: {message_of(errors)[-200:]}")
+    again, errors = run(case.again, place, case.datasets)
+    if again:
+        problems.append(f"with room it ends with code {again}: {message_of(errors)[-200:]}")
     else:
         problems += unreadable(disk) + leftovers(disk)
         if case.result and fingerprint(disk) != fingerprint(base / case.result):
             problems.append("with room it ends with other bits")
     shutil.rmtree(place)
-    return Finding(case.fault, shown(case.arguments), message_of(stderr).replace(str(place), "FOLDER"), process.returncode,
-                   tuple(problems))
+    message = message_of(stderr).replace(str(place), "FOLDER")
+    return Finding(case.fault, shown(case.arguments), message, code, tuple(problems))
 
 
-def run_alone(arguments: Sequence[str], place: Path) -> tuple[int, str]:
-    """Exit code and stderr of `velap arguments` in a process of its own."""
-    process = start(arguments, place, place / "datasets")
+def run_alone(arguments: Sequence[str], place: Path, datasets: str = "datasets", limit: int | None = None) -> Outcome:
+    """A `Run` in a process of its own."""
+    process = start(arguments, place, place / datasets, **({} if limit is None else {FILE_LIMIT: str(limit)}))
     _, stderr = process.communicate()
     return process.returncode, stderr
 
@@ -143,7 +141,7 @@ def _kill(root: Path, kills: int, rng: np.random.Generator, view: View) -> list[
     reports = [kill_and_resume(victim, root / "collect", kills, rng,
                                lambda done: view.show(done, title="killed collecting"))]
     shutil.copytree(root / "collect" / "whole" / "datasets", root / "base" / "datasets")
-    victim = Victim(train, (*train, "--resume"), root / "base" / "datasets", 40)
+    victim = Victim(train, (*train, "--resume"), root / "base" / "datasets", 24)
     reports.append(kill_and_resume(victim, root / "train", kills, rng,
                                    lambda done: view.show(kills + done, title="killed training")))
     shutil.copytree(root / "train" / "whole" / "run", root / "base" / "run")
@@ -157,7 +155,7 @@ def _spoil(root: Path, done: int, view: View) -> list[Finding]:
         findings.append(check(case, root / "base", root / "case", run_alone))
         view.show(done + len(findings), title=case.fault)
     for disk_case in DISK_CASES:
-        findings.append(check_disk(disk_case, root / "base", root / "case"))
+        findings.append(check_disk(disk_case, root / "base", root / "case", run_alone))
         view.show(done + len(findings), title=disk_case.fault)
     return findings
 
