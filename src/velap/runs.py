@@ -17,6 +17,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from velap.errors import CheckpointError, StorageError
+from velap.storage import replace_file
 
 CHECKSUM = "sha256"
 
@@ -45,26 +46,11 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 
 def write_atomic(path: Path, content: bytes) -> None:
-    """All of `content` or nothing: temporary file beside the target, fsync, rename, fsync of the folder."""
+    """All of `content` or nothing, folders made as needed; raises StorageError."""
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with storage_errors(path):
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with open(temporary, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except OSError:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, content)
 
 
 def content_sha256(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:

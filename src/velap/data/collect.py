@@ -25,6 +25,7 @@ from velap.data.behaviours import mixture, reset_options
 from velap.data.episodes import Extras, FrameStore, make_store, write_dataset
 from velap.data.pool import Progress, Worker, run_all, workers
 from velap.errors import DatasetError, StorageError
+from velap.storage import replace_file
 from velap.tasks import Task, get_task
 
 SHARD_TRAJECTORIES = 10
@@ -129,7 +130,7 @@ def _prepare(work: Path, plan: dict[str, Any], resume: bool) -> tuple[str, ...]:
             reason = "they are of another seed, recipe, environment or renderer" if resume else "resume is off"
             notes.append(f"the unfinished trajectories of an earlier run were discarded: {reason}.")
         shutil.rmtree(shards, ignore_errors=True)
-        minari_io.write_atomic(work / PLAN_FILE, json.dumps(plan, sort_keys=True).encode())
+        replace_file(work / PLAN_FILE, json.dumps(plan, sort_keys=True).encode())
     shards.mkdir(exist_ok=True)
     for leftover in shards.glob(".*.tmp"):
         leftover.unlink(missing_ok=True)

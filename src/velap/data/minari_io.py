@@ -91,19 +91,6 @@ def _fsync(path: Path) -> None:
         os.close(descriptor)
 
 
-def write_atomic(path: Path, content: bytes) -> None:
-    """Write a small file so that a reader sees the old or the new content, never a part."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def make_namespace(dataset_id: str) -> None:
     """Create the Minari namespace of `dataset_id` where it is missing."""
     namespace = DATASET_ID_RE.fullmatch(dataset_id).group("namespace")

@@ -21,8 +21,8 @@ import gymnasium as gym
 import numpy as np
 
 from velap.data.behaviours import position_of, run_trajectory
-from velap.data.minari_io import write_atomic
 from velap.errors import VelapError
+from velap.storage import replace_file
 from velap.tasks import Recipe
 
 TEST_STARTS = 100
@@ -69,7 +69,7 @@ def collect_shard(env: gym.Env, job: Job, name: str, context: int, first: int, c
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {key: np.concatenate([run[key] for run in runs]) for key in runs[0]}
     np.savez_compressed(buffer, **arrays)
-    write_atomic(job.shards / name, buffer.getvalue())
+    replace_file(job.shards / name, buffer.getvalue())
     return {"shard": name, "trajectories": count}
 
 
