@@ -76,7 +76,7 @@ def test_killed_training_resumes_to_the_same_bits(base: Path, tmp_path: Path) ->
     victim = Victim(train, (*train, "--resume"), base / "datasets", 24)
     result = kill_and_resume(victim, tmp_path, 1, np.random.default_rng(5), done.append)
     assert result.problems == ()
-    assert (result.kills, result.finished) == (1, 0)
+    assert result.kills == 1
     assert result.fingerprint == fingerprint(base / "run"), "a process of its own trains to the bits of this one"
     assert done == [1]
 
@@ -143,16 +143,16 @@ def test_the_fingerprint_holds_weights_and_losses_but_no_times(base: Path, tmp_p
 
 
 def test_the_report_shows_commands_messages_and_problems() -> None:
-    text = report("velap study faults", [KillReport("velap train", 19, 1, (), "f")],
+    text = report("velap study faults", [KillReport("velap train", 20, (), "f")],
                   [Finding("a | b", "velap fly", "m" * 1000, 2, ()), Finding("bad", "velap x", "no", 0, ("exit code 0",))])
     assert "`velap study faults --write docs/faults.md`" in text
-    assert "| `velap train` | 19 | 1 | as it should be |" in text
+    assert "| `velap train` | 20 | as it should be |" in text
     assert "| bad | `velap x` | no | 0 | exit code 0 |" in text
     assert f"| {'m' * (study.MESSAGE - 1)}… | 2 | as it should be |" in text
 
 
 def test_a_study_with_problems_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(study, "_kill", lambda *arguments: [KillReport("velap train", 2, 0, ("other bits",), "f")])
+    monkeypatch.setattr(study, "_kill", lambda *arguments: [KillReport("velap train", 2, ("other bits",), "f")])
     monkeypatch.setattr(study, "_spoil", lambda *arguments: [Finding("disk full", "velap train", "no", 2, ())])
     console = Console(record=True, file=io.StringIO())
     with pytest.raises(VelapError, match="1 problems in 2 faults"):

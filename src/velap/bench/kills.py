@@ -144,9 +144,6 @@ class KillReport:
 
     command: str
     kills: int
-    """Processes that were killed before they had finished."""
-    finished: int
-    """Processes that had finished before their moment came."""
     problems: tuple[str, ...]
     fingerprint: str
     """Of the uninterrupted run, and of every resumed one if there is no problem."""
@@ -175,28 +172,33 @@ class Victim:
 
 def kill_and_resume(victim: Victim, folder: Path, kills: int, rng: np.random.Generator,
                     on_kill: Callable[[int], None] = lambda done: None) -> KillReport:
-    """Run the command once to the end, then again and again until it is killed, and resume it each time.
+    """Run the command once to the end, then again and again until it was killed `kills` times, and resume it each time.
 
     Every other kill falls on a random fsync, the rest on moments uniform over the time from the first file of a run to its
-    end. Each run works in a folder of its own below `folder`.
+    end; a run that ends before its moment is repeated with another one. Each works in a folder of its own below `folder`.
     """
     whole = folder / "whole"
     seconds = _time_whole(victim, whole)
-    expected, problems, finished = fingerprint(whole), unreadable(whole) + leftovers(whole), 0
-    for number in range(kills):
-        place = folder / f"kill{number}"
+    expected, problems, finished, killed = fingerprint(whole), unreadable(whole) + leftovers(whole), 0, 0
+    while killed < kills and finished <= kills:
+        place = folder / f"run{killed + finished}"
         place.mkdir(parents=True)
-        finished += _start_and_kill(victim, place, number % 2 == 0, seconds, rng)
-        problems += [f"after kill {number}: {problem}" for problem in unreadable(place)]
-        again = victim.go_on(place)
-        _, errors = again.communicate()
-        if again.returncode and "exists already" not in errors:
-            problems.append(f"resume {number} ended with code {again.returncode}: {errors.strip()[-300:]}")
+        if _start_and_kill(victim, place, killed % 2 == 0, seconds, rng):
+            finished += 1
+            continue
+        problems += [f"after kill {killed}: {problem}" for problem in unreadable(place)]
+        resumed = victim.go_on(place)
+        _, errors = resumed.communicate()
+        if resumed.returncode and "exists already" not in errors:
+            problems.append(f"resume {killed} ended with code {resumed.returncode}: {errors.strip()[-300:]}")
         elif fingerprint(place) != expected:
-            problems.append(f"resume {number} ended with other bits")
-        problems += [f"after resume {number}: {problem}" for problem in unreadable(place) + leftovers(place)]
-        on_kill(number + 1)
-    return KillReport("velap " + " ".join(victim.arguments), kills - finished, finished, tuple(problems), expected)
+            problems.append(f"resume {killed} ended with other bits")
+        problems += [f"after resume {killed}: {problem}" for problem in unreadable(place) + leftovers(place)]
+        killed += 1
+        on_kill(killed)
+    if killed < kills:
+        problems.append(f"{finished} runs ended before they were killed")
+    return KillReport("velap " + " ".join(victim.arguments), killed, tuple(problems), expected)
 
 
 def _start_and_kill(victim: Victim, place: Path, at_fsync: bool, seconds: float, rng: np.random.Generator) -> bool:
@@ -204,13 +206,13 @@ def _start_and_kill(victim: Victim, place: Path, at_fsync: bool, seconds: float,
     if at_fsync:
         process = victim.start(place, **{KILL_AT: str(rng.integers(1, victim.fsyncs + 1))})
         process.communicate()
-        return process.returncode == 0
+        return process.returncode >= 0
     process = victim.start(place)
     _wait_for_file(process, place)
     time.sleep(float(rng.uniform(0, seconds)))
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    return process.returncode == 0
+    return process.returncode >= 0
 
 
 def _time_whole(victim: Victim, place: Path) -> float:

@@ -162,15 +162,14 @@ def _spoil(root: Path, done: int, view: View) -> list[Finding]:
 
 def report(command: str, reports: Sequence[KillReport], findings: Sequence[Finding]) -> str:
     """The document, in Markdown."""
-    kills = "\n".join(f"| `{entry.command}` | {entry.kills} | {entry.finished} | {_verdict(entry.problems)} |"
-                      for entry in reports)
+    kills = "\n".join(f"| `{entry.command}` | {entry.kills} | {_verdict(entry.problems)} |" for entry in reports)
     faults = "\n".join(f"| {entry.fault} | `{entry.command}` | {_cell(entry.message)} | {entry.code} | "
                        f"{_verdict(entry.problems)} |" for entry in findings)
     train = ", ".join(f"{name} {SMALL['train'][name]}" for name in ("joint_steps", "latent_steps", "checkpoint_every"))
     return f"""# Faults
 
-Written by `{command} --write docs/faults.md`; run it again after a change. Everything runs as commands in processes of
-their own, on a SpiralMaze shrunk to seconds: {TRAJECTORIES} trajectories; {train}.
+Written by `{command} --write docs/faults.md`; run it again after a change. All runs are commands in processes of their
+own, on a SpiralMaze shrunk to seconds: {TRAJECTORIES} trajectories; {train}.
 
 ## kill -9, then resume
 Every other kill falls on a random fsync, when a file is written and not yet renamed into place; the rest fall on moments
@@ -178,15 +177,15 @@ uniform over the run. After each kill every file that is not hidden is read to i
 Then the command goes on (collecting with another number of workers), and its weights, logged losses or dataset arrays are
 compared with those of an uninterrupted run, bit by bit. Nothing temporary may be left.
 
-| command | kills | finished before | verdict |
-| --- | --- | --- | --- |
+| command | kills | verdict |
+| --- | --- | --- |
 {kills}
 
 ## Spoilt files, wrong commands, full disks
 “As it should be”: one paragraph (or the usage message of a wrong option) that names the fault and the way out, an exit code
 above 0, no traceback, and the folder as it was, file by file. On a full disk the files that are there are readable, none is
-temporary, and the same command finishes once there is room, with the same bits. The dataset is `{DATASET}`; a stranger's
-dataset has no checksums of velap. FOLDER stands for the working folder.
+temporary, and the same command finishes once there is room, with the same bits. The dataset is `{DATASET}`; a
+stranger's dataset has no checksums of velap. FOLDER stands for the working folder.
 
 | fault | command | message | exit code | verdict |
 | --- | --- | --- | --- | --- |
