@@ -98,9 +98,9 @@ def test_project_finds_the_nearest_bank_latent():
     model = make_model()
     z = torch.randn(20, 5)
     found, distance = model.project(z)
-    every = torch.cdist(z, model.bank_latents)
+    every = torch.cdist(z, model.bank_latents.float())
     torch.testing.assert_close(distance, every.min(1).values)
-    torch.testing.assert_close(found, model.bank_latents[every.argmin(1)])
+    torch.testing.assert_close(found, model.bank_latents[every.argmin(1)].float())
 
 
 def test_encode_takes_any_prefix_and_reads_every_frame_of_the_stack():

@@ -260,8 +260,16 @@ class ControllerConfig:
     waypoint_exponent: float = 3.0
     """τ_wp = γ^this: on to the next waypoint, Table 9."""
 
+    lookahead: int = 3
+    """π^l competes with sampled actions, each held for this many simulated steps and judged by Q_min to the waypoint; 0 acts
+    by π^l alone [steps]. ours: π^l pushes into walls at corners that h knows of; 0 in `paper`."""
+    lookahead_samples: int = 32
+    """Actions drawn from g for the lookahead. ours."""
+
     def __post_init__(self) -> None:
         _require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")
+        _require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
+        _require(self.lookahead_samples >= 1, "lookahead_samples", self.lookahead_samples, "at least 1 action")
 
 
 @dataclass(frozen=True)
@@ -350,6 +358,7 @@ PAPER_TRAIN: dict[str, Any] = {
     "policy_every": 1,
     "joint_steps": 8_000,
 }
+PAPER_CONTROLLER: dict[str, Any] = {"lookahead": 0}
 PAPER_PLANNER: dict[str, Any] = {
     "coherent_noise": False,
     "expansion_weight": 0.0,

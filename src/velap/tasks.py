@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from velap.config import PAPER_MODEL, PAPER_PLANNER, PAPER_TRAIN, Config, override
+from velap.config import PAPER_CONTROLLER, PAPER_MODEL, PAPER_PLANNER, PAPER_TRAIN, Config, override
 from velap.errors import UnknownTaskError
 
 PRESETS = ("default", "paper")
@@ -76,6 +76,7 @@ TASKS: dict[str, Task] = {
                     "expansion_weight": 1.0,
                     "anchor": "snap",
                 },
+                "controller": {"n_replan": 15},
             },
         ),
     )
@@ -98,7 +99,7 @@ def make_config(task: str, preset: str = "default") -> Config:
         raise UnknownTaskError(f"unknown preset {preset!r}; expected one of {', '.join(PRESETS)}.")
     config = Config(task=task, preset=preset)
     if preset == "paper":
-        config = override(config, model=PAPER_MODEL, train=PAPER_TRAIN, planner=PAPER_PLANNER)
+        config = override(config, model=PAPER_MODEL, train=PAPER_TRAIN, planner=PAPER_PLANNER, controller=PAPER_CONTROLLER)
     if task in TASKS:
         config = override(config, **TASKS[task].overrides)
         if preset == "default":

@@ -47,6 +47,7 @@ class VelapAgent:
         self._fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
         self._planner = config.planner
         self._n_replan = config.controller.n_replan
+        self._lookahead, self._samples = config.controller.lookahead, config.controller.lookahead_samples
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
         self._device = next(model.parameters()).device
@@ -93,9 +94,29 @@ class VelapAgent:
         actions = self._model.act_global(latents)
         if by_waypoint.any():
             rows = torch.arange(len(latents), device=self._device)
-            local = self._model.act_local(latents, self._waypoints[rows, self._current])
+            local = self._act_local(latents, self._waypoints[rows, self._current])
             actions = torch.where(by_waypoint[:, None], local, actions)
         return self._model.to_env(actions)
+
+    def _act_local(self, latents: Tensor, waypoints: Tensor) -> Tensor:
+        """π^l towards `waypoints` [B, D], or the best of it and sampled actions under the dynamics: actions [B, A].
+
+        The lookahead is ours: every action is held for a few steps of h and the one whose end reaches the waypoint with
+        the highest Q_min wins.
+        """
+        policy = self._model.act_local(latents, waypoints)
+        if self._lookahead == 0:
+            return policy
+        shape = (self._samples, self._fns.noise_dim)
+        drawn = [torch.randn(shape, generator=generator) for generator in self._generators]
+        noise = torch.stack(drawn).to(latents)
+        starts = latents.unsqueeze(1).expand(-1, self._samples + 1, -1)
+        actions = torch.cat([policy.unsqueeze(1), self._fns.propose(starts[:, 1:], noise)], 1)
+        ends = starts
+        for _ in range(self._lookahead):
+            ends = self._fns.step(ends, actions)
+        q_min, _ = self._fns.reach(ends, waypoints.unsqueeze(1).expand_as(ends))
+        return actions[torch.arange(len(actions), device=actions.device), q_min.argmax(1)]
 
     def _replan(self, latents: Tensor, due: Tensor) -> None:
         """Plan for the rows `due` [B] from `latents` [B, D] and store their waypoints."""

@@ -138,7 +138,7 @@ def _roots(model: LatentModel, batch: int) -> Tensor:
     """[B, D] latents to plan from: of the dataset where the model keeps some, else of frames of noise."""
     generator = make_generator(0)
     if model.bank_latents.any():
-        return model.bank_latents[torch.randint(len(model.bank_latents), (batch,), generator=generator)]
+        return model.bank_latents[torch.randint(len(model.bank_latents), (batch,), generator=generator)].float()
     frames = torch.randint(256, (batch, model.config.frame_stack, 64, 64, 3), generator=generator, dtype=torch.uint8)
     return model.encode(frames.to(model.bank_latents.device))
 
