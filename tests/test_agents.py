@@ -10,6 +10,7 @@ from toy_env import ACTION_SCALE, SIDE, ToyEnv, ToyModel, draw, toy_config
 from toy_world import DISCOUNT, START
 from velap.agents.base import METHODS, make_agent
 from velap.agents.velap import VelapAgent
+from velap.config import override
 from velap.errors import UnknownTaskError
 
 
@@ -138,6 +139,21 @@ def test_waypoints_are_passed_when_reached_several_at_once() -> None:
     assert len(agent.waypoints_ahead(0)) == 1
     agent.act(frames_at((-4.0, 9.0)))
     assert agent.waypoints_ahead(0).tolist() == [[-4.0, 9.0]], "the last waypoint stays"
+
+
+@pytest.mark.parametrize(("lookahead", "gets_there"), [(0, False), (3, True)])
+def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: int, gets_there: bool) -> None:
+    model = ToyModel()
+    model.act_local = lambda latent, goal: (goal - latent) / (goal - latent).norm(dim=-1, keepdim=True)  # blind to the wall
+    agent = VelapAgent(model, override(toy_config(n_iter=1), controller={"lookahead": lookahead, "n_replan": 100}))
+    env = ToyEnv()
+    env.reset(seed=0)
+    env.set_agent_position(np.array([-0.5, 3.0]))
+    agent.act(frames_at((-0.5, 3.0)))
+    set_plan(agent, [(-0.5, 3.0), (2.0, 3.0)])
+    for _ in range(20):
+        env.step(agent.act(frames_at(tuple(env.agent_position())))[0])
+    assert (env.agent_position()[0] > 0) == gets_there
 
 
 def test_plan_of_the_root_alone_leaves_it_to_the_global_policy() -> None:
