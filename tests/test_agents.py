@@ -149,8 +149,10 @@ def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: in
     env = ToyEnv()
     env.reset(seed=0)
     env.set_agent_position(np.array([-0.5, 3.0]))
+    model.encode = lambda frames: torch.from_numpy(env.agent_position())[None]  # no rounding to pixels beside the wall
     agent.act(frames_at((-0.5, 3.0)))
-    set_plan(agent, [(-0.5, 3.0), (2.0, 3.0)])
+    with torch.inference_mode():
+        set_plan(agent, [(-0.5, 3.0), (3.0, 9.0)])
     for _ in range(20):
         env.step(agent.act(frames_at(tuple(env.agent_position())))[0])
     assert (env.agent_position()[0] > 0) == gets_there

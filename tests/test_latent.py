@@ -40,7 +40,7 @@ def make_model(**changes) -> LatentModel:
     return model.eval().requires_grad_(False)
 
 
-@pytest.mark.parametrize("prefix", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("prefix", [(), (3,), (2, 3), (0, 2)])
 @pytest.mark.parametrize(
     "changes", [{}, {"norm": "batch"}, {"norm": "none"}, {"critic_bounded": False, "dynamics_residual": False}]
 )

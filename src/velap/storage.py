@@ -8,7 +8,7 @@ from pathlib import Path
 
 def replace_file(path: Path, content: bytes) -> None:
     """All of `content` or nothing: temporary file beside the target, fsync, rename, fsync of the folder. Raises OSError."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.tmp")  # one writer a path: what a killed one left is written over
     try:
         with temporary.open("wb") as file:
             file.write(content)

@@ -97,7 +97,8 @@ class WindowSampler:
 
     def stacks(self, rows: Tensor) -> Tensor:
         """Frame stacks of rows: int64 `[*] → uint8 [*, N, H, W, 3]`."""
-        return self.frames[stack_indices(rows, self.first[rows], self.frame_stack)]
+        index = stack_indices(rows, self.first[rows], self.frame_stack)
+        return self.frames.index_select(0, index.flatten()).view(*index.shape, *self.frames.shape[1:])
 
     def _draw_windows(
         self, windows: int, length: int, whole: bool, generator: torch.Generator
