@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from velap.bench.demo import released_checkpoint
-from velap.config import PlannerConfig, override
+from velap.config import ModelConfig, PlannerConfig, override
 from velap.data.episodes import FrameStore, load_store, make_store, write_dataset
 from velap.errors import CheckpointError, VelapError
 from velap.models.latent import LatentModel, Spaces, load_checkpoint
@@ -90,10 +90,21 @@ def synthetic_store(trajectories: int | None = None) -> FrameStore:
 
 
 def train_frames_per_s(device: torch.device) -> Measurement:
+    """Joint updates as SpiralMaze trains, one frame a state."""
+    return _train_frames_per_s(device, make_config(TASK).model.frame_stack)
+
+
+def train_frames_per_s_stack3(device: torch.device) -> Measurement:
+    """Joint updates with the default of three frames a state, nine channels."""
+    return _train_frames_per_s(device, ModelConfig().frame_stack)
+
+
+def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
     """Joint updates against the forward and backward pass of the encoder alone on frames that lie ready."""
     keep_freed_memory()
     with TemporaryDirectory() as folder:
-        trainer = Trainer(make_config(TASK), synthetic_store(), Path(folder), 0, device)
+        settings = override(make_config(TASK), model={"frame_stack": frame_stack})
+        trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
         config, encoder = trainer.config.train, trainer.model.encoder
         batch = trainer.sampler.sample(config.batch_windows, config.window, config.whole_windows, trainer.generator)
         stacks = trainer.sampler.stacks(batch.rows)
@@ -112,7 +123,7 @@ def train_frames_per_s(device: torch.device) -> Measurement:
         trained, encoded = in_turns([train, encode], 12, device)
     frames = updates * len(stacks)
     return Measurement(frames / trained, "frames/s", f"encoder alone, forward and backward, batch of {len(stacks)} frames, "
-                       f"{config.precision}", frames / encoded)
+                       f"stacks of {frame_stack}, {config.precision}", frames / encoded)
 
 
 def _planning_model(device: torch.device) -> tuple[LatentModel, PlannerConfig, str]:
@@ -143,9 +154,10 @@ def _roots(model: LatentModel, batch: int) -> Tensor:
     return model.encode(frames.to(model.bank_latents.device))
 
 
-def _plan_latency(device: torch.device, batch: int, repeats: int) -> Measurement:
+def _plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int | None = None) -> Measurement:
     """Latency per environment of a VELAP plan for `batch` environments at once against MPPI with the same model."""
     model, planner, kind = _planning_model(device)
+    planner = replace(planner, n_sim=n_sim or planner.n_sim)
     fns = SearchFns(**model.search_fns(planner.neighbour_distance_factor))
     shots, together, seeds = MPPIConfig(), min(batch, MPPI_BATCH), count()
     roots = _roots(model, batch)
@@ -166,6 +178,11 @@ def _plan_latency(device: torch.device, batch: int, repeats: int) -> Measurement
 def plan_latency_1(device: torch.device) -> Measurement:
     """One environment."""
     return _plan_latency(device, 1, 9)
+
+
+def plan_latency_1_sim5(device: torch.device) -> Measurement:
+    """One environment, expansions of 5 steps as in most tasks of Table 8 (SpiralMaze has 10)."""
+    return _plan_latency(device, 1, 9, n_sim=5)
 
 
 def plan_latency_64(device: torch.device) -> Measurement:

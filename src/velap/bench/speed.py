@@ -44,7 +44,9 @@ class Benchmark:
 
 BENCHMARKS: dict[str, Benchmark] = {
     "train_frames_per_s": Benchmark(benchmarks.train_frames_per_s, at_least=0.8),
+    "train_frames_per_s_stack3": Benchmark(benchmarks.train_frames_per_s_stack3, at_least=0.8),
     "plan_latency_1": Benchmark(benchmarks.plan_latency_1, at_most=1 / 50),
+    "plan_latency_1_sim5": Benchmark(benchmarks.plan_latency_1_sim5, at_most=1 / 50),
     "plan_latency_64": Benchmark(benchmarks.plan_latency_64, at_most=1 / 50),
     "env_steps_per_s": Benchmark(benchmarks.env_steps_per_s, at_least=10),
     "train_rss": Benchmark(benchmarks.train_rss, at_most=1),
