@@ -34,7 +34,7 @@ from velap.search.est import plan
 from velap.search.shooting import MPPIConfig, shoot
 from velap.search.types import SearchFns
 from velap.tasks import get_task, make_config
-from velap.training.loop import Trainer, keep_freed_memory
+from velap.training.loop import Trainer, keep_freed_memory, train
 
 TASK = "SpiralMaze"
 DATASET = "bench/synthetic-v0"
@@ -110,7 +110,7 @@ def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
         stacks = trainer.sampler.stacks(batch.rows)
         updates = 4 * config.policy_every
 
-        def train() -> None:
+        def update() -> None:
             for _ in range(updates):
                 trainer.update()
 
@@ -120,7 +120,7 @@ def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
                 latents = encoder(stacks)
                 latents.backward(torch.ones_like(latents))
 
-        trained, encoded = in_turns([train, encode], 12, device)
+        trained, encoded = in_turns([update, encode], 12, device)
     frames = updates * len(stacks)
     return Measurement(frames / trained, "frames/s", f"encoder alone, forward and backward, batch of {len(stacks)} frames, "
                        f"stacks of {frame_stack}, {config.precision}", frames / encoded)
@@ -285,11 +285,10 @@ def write_synthetic() -> None:
 
 def print_peak(run_dir: str, device: str) -> None:
     """Body of the process that `train_rss` measures: trains and prints its peak and the dataset's size [bytes]."""
-    from velap import api
-
     short = {"joint_steps": 30, "latent_steps": 30, "checkpoint_every": 20, "diagnose_every": 20, "log_every": 10}
-    api.train(DATASET, out=Path(run_dir), device=device, changes={"train": short})
-    print(peak_memory(), load_store(DATASET).nbytes)
+    store = load_store(DATASET)
+    train(override(make_config(TASK), train=short), store, Path(run_dir), device=device)
+    print(peak_memory(), store.nbytes)
 
 
 def peak_memory() -> int:

@@ -37,7 +37,7 @@ TRAJECTORIES = 120
 """Trajectories of the shrunk recipe: some reach the goal."""
 FILE_LIMIT, KILL_AT = "VELAP_FILE_LIMIT", "VELAP_KILL_AT_FSYNC"
 """Environment variables of `shrunk_main`: largest file [bytes], number of the fsync to die at."""
-CODE = "import sys; from velap.bench.kills import shrunk_main; sys.exit(shrunk_main())"
+CODE = "import sys; from velap.bench.kills import shrunk_main; from velap.cli import main; sys.exit(shrunk_main(main))"
 
 
 def shrink() -> None:
@@ -47,10 +47,8 @@ def shrink() -> None:
     TASKS[TASK] = dataclasses.replace(task, recipe=recipe, overrides={}, default_overrides=SMALL)
 
 
-def shrunk_main() -> int:
-    """The command line with the shrunk task, and with faults that the environment asks for."""
-    from velap.cli import main
-
+def shrunk_main(main: Callable[[], int]) -> int:
+    """`main`, the command line, with the shrunk task and with faults that the environment asks for."""
     if FILE_LIMIT in os.environ:
         import resource
 
