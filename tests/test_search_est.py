@@ -206,3 +206,23 @@ def test_world_is_exact() -> None:
     assert geodesic(points[2], points[3]).item() == pytest.approx(2.0)
     assert move(points[0] * 0.5, torch.tensor([1.0, 0.0])).tolist() == [-0.5, 0.0]
     assert move(points[1] * HALF_WIDTH, torch.tensor([1.0, 0.0])).tolist() == [HALF_WIDTH, 0.0]
+
+
+def test_few_rows_are_planned_on_one_thread_and_the_setting_comes_back():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    seen = []
+
+    def counted(z):
+        seen.append(torch.get_num_threads())
+        return misleading_value(z)
+
+    try:
+        plan(toy_fns(value=counted), roots(1), PlannerConfig(n_iter=20, candidates=10), torch.Generator().manual_seed(0))
+        assert set(seen) == {1}
+        assert torch.get_num_threads() == 2
+        seen.clear()
+        plan(toy_fns(value=counted), roots(32), PlannerConfig(n_iter=20, candidates=10), torch.Generator().manual_seed(0))
+        assert set(seen) == {2}
+    finally:
+        torch.set_num_threads(before)
