@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from velap.search.expansion import Thresholds, Verdict, expand_, packs, threshol
 from velap.search.sampling import draw_noise
 from velap.search.tree import new_tree, take, trace_back, trimmed
 from velap.search.types import Plan, Rejections, RowGenerator, SearchFns, Tree
+from velap.threads import one_thread
 
 ROWS_A_THREAD = 256
 """Candidates of a round, over all environments, up to which one thread plans. ours: 67 → 52 ms for one environment."""
@@ -33,7 +33,7 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
     noise = draw_noise(cfg, fns.noise_dim, z_root, generator)
     limits = thresholds(cfg, fns.discount, z_root)
     verdicts = []
-    with few_threads(len(z_root) * cfg.candidates, z_root.device):
+    with one_thread(z_root.device, len(z_root) * cfg.candidates <= ROWS_A_THREAD):
         tree = new_tree(z_root, fns.value(z_root), cfg.n_iter + 1)
         for start in range(0, cfg.n_iter, cfg.candidates):
             part = noise.part(start, start + cfg.candidates)
@@ -51,20 +51,6 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
         tree=tree,
         rejections=count_rejections(verdicts, limits),
     )
-
-
-@contextmanager
-def few_threads(rows: int, device: torch.device) -> Iterator[None]:
-    """On a CPU one thread plans for a few rows: waking another costs more than its share of the work."""
-    before = torch.get_num_threads()
-    if device.type != "cpu" or rows > ROWS_A_THREAD or before == 1 or torch.compiler.is_compiling():
-        yield
-        return
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def choose_leaf(tree: Tree, goal_threshold: Tensor | float) -> tuple[Tensor, Tensor]:

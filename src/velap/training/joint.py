@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from velap.config import TrainConfig
 from velap.data.windows import Batch, WindowSampler
 from velap.models.latent import LatentModel
+from velap.threads import one_thread
 from velap.training.losses import (
     Info,
     action_model_loss,
@@ -29,6 +30,9 @@ from velap.training.losses import (
     rollout_mse_loss,
     td_target,
 )
+
+TRANSITIONS_A_THREAD = 512
+"""Transitions of a batch up to which the heads work on one thread of a CPU. ours."""
 
 
 @contextmanager
@@ -106,15 +110,23 @@ class JointLearner:
         """One update of Eq. 2, then one of Eq. 5 and of g."""
         config = self.config
         batch = self.sampler.sample(config.batch_windows, config.window, config.whole_windows, self.generator)
-        latents = self.model.encode(self.sampler.stacks(batch.rows))
-        k = config.dynamics_horizon
-        predicted, truth, valid = rollouts(self.model, latents, batch, k, config.whole_windows)
-        if config.dynamics_loss == "infonce":
-            candidates = latents[: batch.valid.shape[0] * (batch.valid.shape[1] + 1)]
-            dynamics, info = infonce_loss(predicted, truth, candidates, valid, config.temperature)
-        else:
-            dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, torch.ones((), device=latents.device))
-        return self._update(latents, batch, config.c1 * dynamics, {"dynamics/loss": info["loss"]}, True)
+        self.model_optimizer.zero_grad(set_to_none=True)
+        encoded = self.model.encode(self.sampler.stacks(batch.rows))
+        latents = (
+            encoded.detach().requires_grad_()
+        )  # the heads' gradient is gathered here and goes to the encoder in one piece
+        with self._threads(batch):
+            predicted, truth, valid = rollouts(self.model, latents, batch, config.dynamics_horizon, config.whole_windows)
+            if config.dynamics_loss == "infonce":
+                candidates = latents[: batch.valid.shape[0] * (batch.valid.shape[1] + 1)]
+                dynamics, info = infonce_loss(predicted, truth, candidates, valid, config.temperature)
+            else:
+                dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, torch.ones((), device=latents.device))
+            values, more = self.value_loss(latents, batch)
+            (config.c1 * dynamics + values).backward()
+        encoded.backward(latents.grad)
+        with self._threads(batch):
+            return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch)}
 
     def latent_step(self) -> Info:
         """One update on cached latents: the dynamics by rollout error, the other heads as before (when `latent_heads`)."""
@@ -122,9 +134,22 @@ class JointLearner:
         config = self.config
         batch = self.sampler.sample(config.latent_batch, config.latent_horizon, False, self.generator)
         latents = self.cache[batch.rows]
-        predicted, truth, valid = rollouts(self.model, latents, batch, config.latent_horizon, False)
-        dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, self.step_square)
-        return self._update(latents, batch, dynamics, {"dynamics/loss": info["loss"]}, config.latent_heads)
+        self.model_optimizer.zero_grad(set_to_none=True)
+        with self._threads(batch):
+            predicted, truth, valid = rollouts(self.model, latents, batch, config.latent_horizon, False)
+            dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, self.step_square)
+            if not config.latent_heads:
+                dynamics.backward()
+                self.model_optimizer.step()
+                self.updates += 1
+                return {"dynamics/loss": info["loss"]}
+            values, more = self.value_loss(latents, batch)
+            (dynamics + values).backward()
+            return {"dynamics/loss": info["loss"], **more, **self._step(latents, batch)}
+
+    def _threads(self, batch: Batch) -> AbstractContextManager[None]:
+        """One thread for the heads while a batch is small."""
+        return one_thread(batch.start.device, len(batch.start) <= TRANSITIONS_A_THREAD)
 
     def begin_latent_phase(self) -> None:
         """Freeze the encoder, cache every latent of the dataset [F, D], start fresh optimisers."""
@@ -140,25 +165,15 @@ class JointLearner:
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate
 
-    def _update(self, latents: Tensor, batch: Batch, dynamics: Tensor, info: Info, heads: bool) -> Info:
-        self.model_optimizer.zero_grad(set_to_none=True)
-        loss = dynamics
-        if heads:
-            values, more = self.value_loss(latents, batch)
-            loss = loss + values
-            info |= more
-        loss.backward()
+    def _step(self, latents: Tensor, batch: Batch) -> Info:
+        """Apply the gradients, let the targets follow, and update the policies when it is their turn. latents [M, D]."""
         self.model_optimizer.step()
         self.updates += 1
-        if heads:
-            rate = self.config.target_rate
-            target, source, target_buffers, source_buffers = self._target_pairs
-            polyak(target, source, rate)
-            for old, new in zip(target_buffers, source_buffers, strict=True):
-                old.copy_(new)
-            if self.updates % self.config.policy_every == 0:
-                info |= self._update_policies(latents.detach(), batch)
-        return info
+        target, source, target_buffers, source_buffers = self._target_pairs
+        polyak(target, source, self.config.target_rate)
+        for old, new in zip(target_buffers, source_buffers, strict=True):
+            old.copy_(new)
+        return self._update_policies(latents, batch) if self.updates % self.config.policy_every == 0 else {}
 
     def value_loss(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
         """1/n Σ L_Q^l + c0 · L_Q^g of Eq. 2, with the targets of Eq. 3 and 4 from the target critics."""
