@@ -356,7 +356,7 @@ PAPER_TRAIN: dict[str, Any] = {
     "rewarded_share": 0.0,
     "target_rate": 0.005,
     "policy_every": 1,
-    "joint_steps": 12_000,
+    "joint_steps": 24_000,
 }
 PAPER_CONTROLLER: dict[str, Any] = {"lookahead": 0}
 PAPER_PLANNER: dict[str, Any] = {
