@@ -223,7 +223,13 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tup
     raw = json.loads(metadata["spaces"])
     spaces = Spaces(raw["height"], raw["width"], tuple(raw["action_low"]), tuple(raw["action_high"]))
     model = LatentModel(config.model, spaces, config.train.discount, config.train.precision)
-    expected = model.state_dict()
+    restore(model, tensors, path)
+    return model.to(device).eval().requires_grad_(False), config, metadata
+
+
+def restore(module: nn.Module, tensors: Mapping[str, Tensor], path: Path | str) -> None:
+    """Load weights into a module built from the file's own config; raises CheckpointError where names or shapes differ."""
+    expected = module.state_dict()
     wrong = sorted(
         name
         for name in expected.keys() | tensors.keys()
@@ -234,5 +240,4 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tup
             f"{path} does not fit its own config: {len(wrong)} tensors differ, {wrong[0]} first. "
             "The file comes from another version of velap; train again."
         )
-    model.load_state_dict(tensors)
-    return model.to(device).eval().requires_grad_(False), config, metadata
+    module.load_state_dict(tensors)
