@@ -142,13 +142,27 @@ def test_rollouts_chain_the_dynamics_along_the_data(tmp_path):
     run = trainer(tmp_path)
     batch = run.sampler.sample(3, 5, True, run.generator)
     latents = torch.randn(len(batch.rows), 4)
-    predicted, truth, valid = rollouts(run.model, latents, batch, 2, True)
-    assert predicted.shape == (2, 12, 4)
-    # rollout 5 starts in window 1 (6 frames each) at step 1
+    predicted, truth, valid = rollouts(run.model, latents, batch, 3)
+    assert predicted.shape == (3, 9, 4)
+    # rollout 4 starts in window 1 (6 frames each) at step 1
     first = run.model.step(latents[7], batch.actions[1, 1])
-    torch.testing.assert_close(predicted[0, 5], first)
-    torch.testing.assert_close(predicted[1, 5], run.model.step(first, batch.actions[1, 2]))
-    assert truth[:, 5].tolist() == [8, 9] and valid[:, 5].tolist() == batch.valid[1, 1:3].tolist()
+    torch.testing.assert_close(predicted[0, 4], first)
+    torch.testing.assert_close(predicted[1, 4], run.model.step(first, batch.actions[1, 2]))
+    assert truth[:, 4].tolist() == [8, 9, 10] and valid[:, 4].tolist() == batch.valid[1, 1:4].tolist()
+
+
+def test_a_part_of_the_transitions_is_drawn_anew_for_every_batch(tmp_path):
+    run = trainer(tmp_path, value_transitions=7, dynamics_rollouts=4)
+    batches = [run.sampler.sample(3, 5, True, run.generator) for _ in range(40)]
+    for batch in batches:
+        assert len(batch.start.unique()) == len(batch.start) == len(batch.weight) == len(batch.goals.position) == 7
+        assert len(batch.unrolled.unique()) == len(batch.unrolled) == 4 and (batch.unrolled % 6 <= 2).all()
+        inside = batch.valid[batch.start // 6, batch.start % 6]
+        assert torch.equal(batch.weight, inside.float())
+        assert torch.equal(batch.action, batch.actions[batch.start // 6, batch.start % 6])
+    assert len(torch.cat([batch.start for batch in batches]).unique()) == 15  # the last frame of a window starts nothing
+    only_first = run.sampler.sample(3, 5, False, run.generator)
+    assert only_first.start.tolist() == only_first.unrolled.tolist() == [0, 6, 12]
 
 
 def test_latent_phase_leaves_the_encoder_alone(tmp_path):

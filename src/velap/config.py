@@ -85,13 +85,18 @@ class TrainConfig:
 
     joint_steps: int = 4_000
     """Model updates of the joint phase [steps]. ours: the paper gives no number."""
-    batch_windows: int = 12
+    batch_windows: int = 24
     """Windows of consecutive frames a batch. Table 7: 64 transitions, so 64 windows with `whole_windows` off."""
     window: int = 20
     """Transitions a window [steps]. ours; `dynamics_horizon` in `paper`, where only the first transition trains the
     values."""
     whole_windows: bool = True
     """Every transition of a window trains the values, and goals come from the encoded frames. ours; off in `paper`."""
+    value_transitions: int = 96
+    """Transitions of a batch of whole windows that train values and policies, drawn at random; 0 takes all. ours: beyond a
+    hundred or so, more frames teach more than more transitions of the same frames."""
+    dynamics_rollouts: int = 96
+    """Rollouts of h a batch of whole windows, their starts drawn at random; 0 starts one wherever k steps are left. ours."""
     learning_rate: float = 3e-4
     """Table 7, Adam."""
     c0: float = 0.2
@@ -147,8 +152,8 @@ class TrainConfig:
     """Model updates between checkpoints [steps]. ours."""
 
     def __post_init__(self) -> None:
-        for name in ("joint_steps", "latent_steps"):
-            _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more steps")
+        for name in ("joint_steps", "latent_steps", "value_transitions", "dynamics_rollouts"):
+            _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in (
             "batch_windows",
             "window",
@@ -352,6 +357,8 @@ PAPER_TRAIN: dict[str, Any] = {
     "batch_windows": 64,
     "window": 3,
     "whole_windows": False,
+    "value_transitions": 0,
+    "dynamics_rollouts": 0,
     "latent_steps": 0,
     "rewarded_share": 0.0,
     "target_rate": 0.005,

@@ -1,6 +1,7 @@
 """Batches of windows of consecutive frames, goals relabelled by index (App. B.4). Frames are gathered late, by row.
 
-Letters: B windows, L steps a window, M rows to encode, T value transitions, A action dimension, F frames of the store.
+Letters: B windows, L steps a window, M rows to encode, T value transitions, W rollouts, A action dimension, F frames of the
+store.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ class Batch(NamedTuple):
     """bool [B, L], the transition lies inside its episode."""
     actions: Tensor
     """float32 [B, L, A] in [-1, 1]."""
+    unrolled: Tensor
+    """int64 [W], position of the latents that the dynamics are unrolled from."""
     start: Tensor
     """int64 [T], position of z_t."""
     action: Tensor
@@ -64,14 +67,19 @@ class WindowSampler:
             raise DatasetError("the dataset has no transition to train on; expected episodes of at least one step.")
 
     def sample(self, windows: int, length: int, whole: bool, generator: torch.Generator) -> Batch:
-        """B `windows` of L `length` steps; with `whole` every transition trains the values, else only each window's
-        first."""
+        """B `windows` of L `length` steps; with `whole` the values learn from transitions and the dynamics from starts all
+        over them (as many as the config says), else from each window's first."""
         _, last, at = self._draw_windows(windows, length, whole, generator)
         window_rows = torch.minimum(at[:, None] + torch.arange(length + 1, device=self.device), last[:, None])
         valid = at[:, None] + torch.arange(length, device=self.device) < last[:, None]
-        used = length if whole else 1
         positions = torch.arange(windows * (length + 1), device=self.device).view(windows, length + 1)
-        start = positions[:, :used].reshape(-1)
+        if whole:
+            ahead_of_end = length - self.config.dynamics_horizon + 1
+            start = self._draw(positions[:, :length], self.config.value_transitions, generator)
+            unrolled = self._draw(positions[:, :ahead_of_end], self.config.dynamics_rollouts, generator)
+        else:
+            start = unrolled = positions[:, 0]
+        inside = valid[start // (length + 1), start % (length + 1)]
         rows = window_rows.reshape(-1)
         chosen = rows[start]
         extra = None
@@ -80,20 +88,28 @@ class WindowSampler:
             ahead = 2 + (torch.rand(windows, generator=generator, device=self.device) * span).long()
             extra = torch.minimum(chosen + ahead, last)
             rows = torch.cat([rows, extra])
-        goals = relabel(rows, start, valid[:, :used].reshape(-1), valid, self.config, generator)
+        goals = relabel(rows, start, inside, valid, self.config, generator)
         ended = self.terminated[chosen]
         proceeds = (~ended).float()
         return Batch(
             rows=rows,
             valid=valid,
             actions=self.actions[window_rows[:, :-1]],
+            unrolled=unrolled,
             start=start,
             action=self.actions[chosen],
             reward=self.rewards[chosen],
             proceeds=proceeds,
-            weight=valid[:, :used].reshape(-1).float(),
+            weight=inside.float(),
             goals=goals._replace(proceeds=goals.proceeds * proceeds),
         )
+
+    def _draw(self, positions: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """`count` of the positions without repetition, or all of them where they are no more or `count` is 0."""
+        everything = positions.reshape(-1)
+        if not 0 < count < len(everything):
+            return everything
+        return everything[torch.randperm(len(everything), generator=generator, device=self.device)[:count]]
 
     def stacks(self, rows: Tensor) -> Tensor:
         """Frame stacks of rows: int64 `[*] → uint8 [*, N, H, W, 3]`."""

@@ -48,22 +48,19 @@ def evaluated(*modules: nn.Module) -> Iterator[None]:
             module.train()
 
 
-def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int, every_start: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """k-step predictions of h along the data's actions: predicted [k, W, D], positions int64 [k, W] of the truth, valid
-    [k, W].
-
-    latents [M, D]; rollouts start at every step of a window that leaves k steps, or at the first one only.
+def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple[Tensor, Tensor, Tensor]:
+    """k-step predictions of h along the data's actions from `batch.unrolled`: predicted [k, W, D], positions int64 [k, W] of
+    the truth, valid [k, W]. latents [M, D].
     """
-    windows, length = batch.valid.shape
-    starts = length - k + 1 if every_start else 1
-    positions = torch.arange(windows * (length + 1), device=latents.device).view(windows, length + 1)
-    latent = latents[positions[:, :starts].reshape(-1)]
+    width = batch.valid.shape[1] + 1
+    window, step = batch.unrolled // width, batch.unrolled % width
+    latent = latents[batch.unrolled]
     predicted, truth, valid = [], [], []
     for i in range(k):
-        latent = model.step(latent, batch.actions[:, i : i + starts].reshape(-1, batch.actions.shape[-1]))
+        latent = model.step(latent, batch.actions[window, step + i])
         predicted.append(latent)
-        truth.append(positions[:, i + 1 : i + 1 + starts].reshape(-1))
-        valid.append(batch.valid[:, i : i + starts].reshape(-1))
+        truth.append(batch.unrolled + i + 1)
+        valid.append(batch.valid[window, step + i])
     return torch.stack(predicted), torch.stack(truth), torch.stack(valid)
 
 
@@ -116,7 +113,7 @@ class JointLearner:
             encoded.detach().requires_grad_()
         )  # the heads' gradient is gathered here and goes to the encoder in one piece
         with self._threads(batch):
-            predicted, truth, valid = rollouts(self.model, latents, batch, config.dynamics_horizon, config.whole_windows)
+            predicted, truth, valid = rollouts(self.model, latents, batch, config.dynamics_horizon)
             if config.dynamics_loss == "infonce":
                 candidates = latents[: batch.valid.shape[0] * (batch.valid.shape[1] + 1)]
                 dynamics, info = infonce_loss(predicted, truth, candidates, valid, config.temperature)
@@ -136,7 +133,7 @@ class JointLearner:
         latents = self.cache[batch.rows]
         self.model_optimizer.zero_grad(set_to_none=True)
         with self._threads(batch):
-            predicted, truth, valid = rollouts(self.model, latents, batch, config.latent_horizon, False)
+            predicted, truth, valid = rollouts(self.model, latents, batch, config.latent_horizon)
             dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, self.step_square)
             if not config.latent_heads:
                 dynamics.backward()
