@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from velap.config import Config, override
+from velap.storage import run_dir
 from velap.tasks import TASKS, get_task, make_config
 
 if TYPE_CHECKING:
@@ -41,11 +42,6 @@ def task_of(task_or_dataset: str) -> str:
 def config_for(task: str, preset: str, changes: Changes | None) -> Config:
     """The preset's config of a task or foreign dataset with `changes` applied."""
     return override(make_config(task, preset), **{part: dict(fields) for part, fields in (changes or {}).items()})
-
-
-def run_dir(task: str, preset: str, seed: int) -> Path:
-    """Where a training run lives unless said otherwise."""
-    return Path("runs") / task.replace("/", "_") / preset / f"seed{seed}"
 
 
 def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwrite: bool = False) -> str:

@@ -1,9 +1,14 @@
-"""Writing a file as a whole or not at all."""
+"""Where runs lie, and writing a file as a whole or not at all."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+
+
+def run_dir(task: str, preset: str, seed: int) -> Path:
+    """Where a training run lives unless said otherwise."""
+    return Path("runs") / task.replace("/", "_") / preset / f"seed{seed}"
 
 
 def replace_file(path: Path, content: bytes) -> None:

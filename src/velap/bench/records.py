@@ -24,6 +24,12 @@ IDENTITY = ("task", "method", "preset", "train_seed", "env", "config_hash", "che
 """Fields that every record of one file shares."""
 
 
+def record_path(root: Path, task: str, method: str, preset: str, train_seed: int) -> Path:
+    """`<root>/<task>/<method>-<preset>/train<seed>.jsonl`."""
+    folder = task.replace("/", "_").replace(":", "_")
+    return root / folder / f"{method}-{preset}" / f"train{train_seed}.jsonl"
+
+
 @dataclass(frozen=True)
 class RunKey:
     """What decides the result of an episode besides its seed."""
@@ -42,9 +48,8 @@ class RunKey:
     """Package version and commit; may differ between the records of one file."""
 
     def path(self, root: Path) -> Path:
-        """`<root>/<task>/<method>-<preset>/train<seed>.jsonl`."""
-        folder = self.task.replace("/", "_").replace(":", "_")
-        return root / folder / f"{self.method}-{self.preset}" / f"train{self.train_seed}.jsonl"
+        """Its record file below `root`."""
+        return record_path(root, self.task, self.method, self.preset, self.train_seed)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,44 @@
+"""Table 1 of the paper, as data.
+
+Source: VELAP (Value-guided Expansive Latent Planning), CoRL 2023, §5.1, Table 1: "Success rates and std. deviations (%) on
+test cases with unseen object variations (except SpiralMaze)".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+METHODS = ("bc", "bc-success", "td3bc", "iql", "mppi", "mbop", "iris", "iris-multistep", "velap")
+"""Columns of Table 1, in its order, in the names of our records."""
+
+TASKS = ("SpiralMaze", "ObstacleMaze", "WindowClose", "FaucetClose", "ButtonWall", "DrawerButton")
+"""Rows of Table 1, in its order."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """One cell of Table 1."""
+
+    mean: int
+    """Success rate [%]."""
+    deviation: int
+    """Standard deviation over training runs [%]."""
+
+
+_ROWS: dict[str, tuple[tuple[int, int], ...]] = {
+    "SpiralMaze": ((0, 0), (0, 0), (0, 0), (0, 0), (0, 0), (0, 0), (0, 0), (15, 31), (94, 3)),
+    "ObstacleMaze": ((0, 0), (15, 6), (35, 22), (6, 3), (83, 11), (40, 25), (50, 25), (62, 14), (97, 2)),
+    "WindowClose": ((0, 0), (34, 11), (16, 8), (9, 4), (70, 7), (23, 4), (69, 3), (43, 20), (78, 4)),
+    "FaucetClose": ((0, 0), (36, 6), (13, 7), (8, 4), (41, 7), (33, 2), (10, 2), (3, 1), (51, 12)),
+    "ButtonWall": ((0, 0), (0, 0), (2, 2), (0, 0), (9, 10), (0, 0), (35, 5), (8, 8), (76, 9)),
+    "DrawerButton": ((0, 0), (0, 0), (0, 0), (1, 0), (0, 0), (0, 0), (5, 3), (0, 0), (11, 3)),
+}
+
+TABLE_1 = {(task, method): Published(*cell) for task, row in _ROWS.items() for method, cell in zip(METHODS, row, strict=True)}
+"""(task, method) -> what the paper reports."""
+
+LABELS = {
+    "bc": "BC", "bc-success": "BC (D*)", "td3bc": "TD3-BC", "iql": "IQL", "iql-sparse": "IQL (0.9 / 10)", "mppi": "MPPI",
+    "mbop": "MBOP", "iris": "IRIS", "iris-multistep": "IRIS (multi-step)", "velap": "VELAP", "random": "random",
+}
+"""How tables name the methods."""
