@@ -44,9 +44,10 @@ def make_model(**changes) -> LatentModel:
 @pytest.mark.parametrize(
     "changes", [{}, {"norm": "batch"}, {"norm": "none"}, {"critic_bounded": False, "dynamics_residual": False}]
 )
-def test_search_functions_equal_the_model(prefix, changes):
+@pytest.mark.parametrize("hidden", [None, "float32"])
+def test_search_functions_equal_the_model(prefix, changes, hidden):
     model = make_model(**changes)
-    fns = model.search_fns(2.0)
+    fns = model.search_fns(2.0, hidden)
     z, goal = torch.randn(*prefix, 5), torch.randn(*prefix, 5)
     action, noise = torch.rand(*prefix, 2) * 2 - 1, torch.randn(*prefix, 2)
     pairs = [
