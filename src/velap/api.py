@@ -23,7 +23,7 @@ from velap.tasks import TASKS, get_task, make_config
 if TYPE_CHECKING:
     from velap.agents.base import Agent
     from velap.bench.report import Summary
-    from velap.training.loop import Progress
+    from velap.training.steps import Progress
 
 RECORDS = Path("results/records")
 """Where evaluations keep their episode records."""

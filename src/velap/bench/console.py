@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 if TYPE_CHECKING:
     from velap.bench.records import Record
-    from velap.training.loop import Progress as TrainProgress
+    from velap.training.steps import Progress as TrainProgress
 
 LINE_EVERY = 15.0
 """Seconds between progress lines where the output is no terminal [s]."""

@@ -1,4 +1,4 @@
-"""The training loop: phases, logging, diagnostics, atomic checkpoints, exact resume.
+"""A joint training run: phases, diagnostics, atomic checkpoints, exact resume.
 
 A run directory holds `config.json`, `metrics.jsonl`, TensorBoard events, `state.safetensors` (everything a resume
 needs) and, at the end, `model.safetensors`.
@@ -10,13 +10,9 @@ import contextlib
 import ctypes
 import json
 import math
-import signal
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import torch
@@ -25,30 +21,15 @@ from torch import Tensor
 from velap.config import Config
 from velap.data.episodes import FrameStore
 from velap.data.windows import WindowSampler
-from velap.errors import CheckpointError, ConfigError, DatasetError, TrainingError
+from velap.errors import CheckpointError, ConfigError, DatasetError
 from velap.models.latent import LatentModel, Spaces, save_checkpoint
 from velap.runs import MetricsLog, make_generator, write_atomic
 from velap.training.diagnostics import diagnose, measure_latents
 from velap.training.joint import JointLearner
 from velap.training.state import SCHEDULE, load_state, save_state
+from velap.training.steps import Cadence, Progress, interrupt_flag, run_steps
 
 STATE, MODEL = "state.safetensors", "model.safetensors"
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a progress view needs."""
-
-    phase: str
-    """`joint` or `latent`."""
-    step: int
-    """Updates done, both phases counted [steps]."""
-    total: int
-    """Updates of the whole run [steps]."""
-    seconds: float
-    """Training time so far, earlier sittings included [s]."""
-    info: dict[str, float]
-    """The latest losses and diagnostics."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +43,22 @@ class TrainResult:
     diagnostics: dict[str, float]
 
 
+def holdout_episodes(store: FrameStore, count: int, seed: int, *, rewarded: bool = False) -> np.ndarray:
+    """Episodes int64 [*] kept for diagnostics: `count` unrewarded ones, at most a tenth of the data (with `rewarded`: that
+    many successful ones, at most a tenth of those)."""
+    starts, lengths = store.episode_start, store.episode_length
+    pool = [e for e in range(len(starts)) if bool(store.rewards[starts[e] : starts[e] + lengths[e]].any()) == rewarded]
+    n = min(count, (len(pool) if rewarded else len(starts)) // 10, len(pool))
+    return np.random.default_rng([seed, 7]).permutation(np.array(pool, dtype=np.int64))[:n]
+
+
 class Trainer:
     """One run: builds the learner, steps through the phases, saves and resumes."""
 
     def __init__(self, config: Config, store: FrameStore, run_dir: Path, seed: int, device: torch.device) -> None:
         self.config, self.store, self.run_dir, self.seed, self.device = config, store, Path(run_dir), seed, device
         train = config.train
-        self.holdout = self._holdout()
+        self.holdout = holdout_episodes(store, train.holdout_episodes, seed)
         self.sampler = WindowSampler(store, train, config.model.frame_stack, device, self.holdout)
         self._check_lengths()
         height, width = store.frames.shape[1:3]
@@ -85,12 +75,26 @@ class Trainer:
         """Updates of both phases [steps]."""
         return self.config.train.joint_steps + self.config.train.latent_steps
 
-    def _holdout(self) -> np.ndarray:
-        """Episodes kept for the diagnostics: unrewarded ones, at most a tenth of the data."""
-        starts, lengths = self.store.episode_start, self.store.episode_length
-        plain = [e for e in range(len(starts)) if not self.store.rewards[starts[e] : starts[e] + lengths[e]].any()]
-        n = min(self.config.train.holdout_episodes, len(starts) // 10, len(plain))
-        return np.random.default_rng([self.seed, 7]).permutation(np.array(plain, dtype=np.int64))[:n]
+    @property
+    def phase(self) -> str:
+        """`joint` or `latent`."""
+        return "joint" if self.step <= self.config.train.joint_steps else "latent"
+
+    @property
+    def cadence(self) -> Cadence:
+        """As the config says."""
+        train = self.config.train
+        return Cadence(train.log_every, train.diagnose_every, train.checkpoint_every)
+
+    @property
+    def state_path(self) -> Path:
+        """`state.safetensors` of the run."""
+        return self.run_dir / STATE
+
+    @property
+    def events_dir(self) -> Path:
+        """TensorBoard folder of the run."""
+        return self.run_dir / "tensorboard"
 
     def _check_lengths(self) -> None:
         longest, k = int(self.store.episode_length.max()), self.config.train.dynamics_horizon
@@ -125,11 +129,11 @@ class Trainer:
     def save(self) -> None:
         """Everything a resume needs, in one atomic file."""
         metadata = self._identity() | {"step": str(self.step), "seconds": repr(self.seconds)}
-        save_state(self.run_dir / STATE, self.learner, metadata)
+        save_state(self.state_path, self.learner, metadata)
 
     def resume(self) -> None:
         """Continue from `state.safetensors`; raises CheckpointError when it belongs to another run."""
-        metadata = load_state(self.run_dir / STATE, self.learner, self._identity())
+        metadata = load_state(self.state_path, self.learner, self._identity())
         self.step, self.seconds = int(metadata["step"]), float(metadata["seconds"])
 
     def _identity(self) -> dict[str, str]:
@@ -195,31 +199,11 @@ def train(
     write_atomic(run_dir / "config.json", config.to_json().encode())
     log = MetricsLog(run_dir / "metrics.jsonl", resumed)
     with interrupt_flag() as interrupted:
-        _run(trainer, log, on_progress, interrupted)
+        run_steps(trainer, log, on_progress, interrupted)
     trainer.save()
     if trainer.step < trainer.total:
         raise KeyboardInterrupt
     return trainer.finish(command)
-
-
-@contextlib.contextmanager
-def interrupt_flag() -> Iterator[threading.Event]:
-    """Ctrl-C sets the flag instead of breaking an update in two; a second one raises at once."""
-    flag = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag
-        return
-    previous = signal.getsignal(signal.SIGINT)
-
-    def note(number: int, frame: FrameType | None) -> None:
-        flag.set()
-        signal.signal(signal.SIGINT, previous)
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 def keep_freed_memory() -> None:
@@ -247,36 +231,3 @@ def pick_device(device: str) -> torch.device:
     if found.type == "cuda" and not torch.cuda.is_available():
         raise ConfigError(f"device {device!r} was asked for and PyTorch finds no CUDA here. Use --device auto or cpu.")
     return found
-
-
-def _run(trainer: Trainer, log: MetricsLog, on_progress: Callable[[Progress], None], interrupted: threading.Event) -> None:
-    from torch.utils.tensorboard import SummaryWriter
-
-    train = trainer.config.train
-    writer = SummaryWriter(str(trainer.run_dir / "tensorboard"), purge_step=trainer.step)
-    clock = time.monotonic()
-    while trainer.step < trainer.total and not interrupted.is_set():
-        info = trainer.update()
-        row: dict[str, float] = {}
-        last = trainer.step == trainer.total
-        if trainer.step % train.log_every == 0 or last:
-            row |= {name: float(value) for name, value in info.items()}
-            bad = sorted(name for name, value in row.items() if not math.isfinite(value))
-            if bad:
-                raise TrainingError(
-                    f"{', '.join(bad)} became NaN or infinite at step {trainer.step}. The last good state is in "
-                    f"{trainer.run_dir / STATE}; lower the learning rate or check the data for bad actions."
-                )
-        if trainer.step % train.diagnose_every == 0 or last:
-            row |= trainer.report()
-        now = time.monotonic()
-        trainer.seconds, clock = trainer.seconds + now - clock, now
-        if row:
-            phase = "joint" if trainer.step <= train.joint_steps else "latent"
-            log.append({"step": trainer.step, "phase": phase, "seconds": round(trainer.seconds, 1), **row})
-            for name, value in row.items():
-                writer.add_scalar(name, value, trainer.step)
-            on_progress(Progress(phase, trainer.step, trainer.total, trainer.seconds, row))
-        if trainer.step % train.checkpoint_every == 0:
-            trainer.save()
-    writer.close()
