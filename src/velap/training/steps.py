@@ -1,0 +1,143 @@
+"""The one loop that steps through a training run: logs, TensorBoard, diagnostics, checkpoints, Ctrl-C, losses that are not
+finite. Joint training and the learners on frozen latents are driven by it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple, Protocol
+
+from torch import Tensor
+
+from velap.errors import TrainingError
+from velap.runs import MetricsLog
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress view needs."""
+
+    phase: str
+    """`joint` or `latent`, or the method whose head is learnt."""
+    step: int
+    """Updates done, both phases counted [steps]."""
+    total: int
+    """Updates of the whole run [steps]."""
+    seconds: float
+    """Training time so far, earlier sittings included [s]."""
+    info: dict[str, float]
+    """The latest losses and diagnostics."""
+
+
+class Cadence(NamedTuple):
+    """Updates between two of each [steps]."""
+
+    log: int
+    diagnose: int
+    checkpoint: int
+
+
+class Run(Protocol):
+    """What `run_steps` drives: joint training and the learners on frozen latents."""
+
+    step: int
+    """Updates done [steps]."""
+    seconds: float
+    """Training time so far [s]."""
+
+    @property
+    def total(self) -> int:
+        """Updates of the whole run [steps]."""
+        ...
+
+    @property
+    def phase(self) -> str:
+        """Name of what the last update belonged to."""
+        ...
+
+    @property
+    def cadence(self) -> Cadence:
+        """How often to log, diagnose and save."""
+        ...
+
+    @property
+    def state_path(self) -> Path:
+        """Where `save` puts the state."""
+        ...
+
+    @property
+    def events_dir(self) -> Path:
+        """Folder of the TensorBoard events."""
+        ...
+
+    def update(self) -> dict[str, Tensor]:
+        """One update; adds one to `step`."""
+        ...
+
+    def report(self) -> dict[str, float]:
+        """Diagnostics on held-out episodes."""
+        ...
+
+    def save(self) -> None:
+        """Everything a resume needs."""
+        ...
+
+
+def run_steps(run: Run, log: MetricsLog, on_progress: Callable[[Progress], None], interrupted: threading.Event) -> None:
+    """Update to the end or until interrupted; logs, diagnoses, saves, and raises TrainingError when a loss is not finite."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    every = run.cadence
+    writer = SummaryWriter(str(run.events_dir), purge_step=run.step)
+    clock = time.monotonic()
+    while run.step < run.total and not interrupted.is_set():
+        info = run.update()
+        row: dict[str, float] = {}
+        last = run.step == run.total
+        if run.step % every.log == 0 or last:
+            row |= {name: float(value) for name, value in info.items()}
+            bad = sorted(name for name, value in row.items() if not math.isfinite(value))
+            if bad:
+                raise TrainingError(
+                    f"{', '.join(bad)} became NaN or infinite at step {run.step}. The last good state is in "
+                    f"{run.state_path}; lower the learning rate or check the data for bad actions."
+                )
+        if run.step % every.diagnose == 0 or last:
+            row |= run.report()
+        now = time.monotonic()
+        run.seconds, clock = run.seconds + now - clock, now
+        if row:
+            log.append({"step": run.step, "phase": run.phase, "seconds": round(run.seconds, 1), **row})
+            for name, value in row.items():
+                writer.add_scalar(name, value, run.step)
+            on_progress(Progress(run.phase, run.step, run.total, run.seconds, row))
+        if run.step % every.checkpoint == 0:
+            run.save()
+    writer.close()
+
+
+@contextlib.contextmanager
+def interrupt_flag() -> Iterator[threading.Event]:
+    """Ctrl-C sets the flag instead of breaking an update in two; a second one raises at once."""
+    flag = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: FrameType | None) -> None:
+        flag.set()
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, previous)
