@@ -4,20 +4,49 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from velap.errors import CheckpointError
 from velap.runs import load_tensors, save_tensors
-from velap.training.joint import JointLearner
 
 STATE_FORMAT = "velap-training-state/1"
 SCHEDULE = "schedule"
 """Metadata key of what has no effect before the latent phase begins."""
 
 
-def save_state(path: Path, learner: JointLearner, metadata: Mapping[str, str]) -> None:
+class Learner(Protocol):
+    """What has a state: the joint learner, and those on frozen latents."""
+
+    generator: torch.Generator
+    updates: int
+    """Updates so far, for what happens every few of them."""
+    cache: Tensor | None
+    """float32 [F, D] latents of all frames once the encoder is frozen."""
+
+    @property
+    def model(self) -> nn.Module:
+        """What is learnt."""
+        ...
+
+    @property
+    def targets(self) -> Mapping[str, nn.Module]:
+        """Target networks by name."""
+        ...
+
+    @property
+    def optimizers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """Optimisers by name."""
+        ...
+
+    def begin_latent_phase(self) -> None:
+        """Freeze the encoder and fill the cache, where that is still to do."""
+        ...
+
+
+def save_state(path: Path, learner: Learner, metadata: Mapping[str, str]) -> None:
     """Write everything that a resume to the same bits needs, atomically."""
     tensors = {f"model/{name}": value for name, value in learner.model.state_dict().items()}
     for name, module in learner.targets.items():
@@ -30,7 +59,7 @@ def save_state(path: Path, learner: JointLearner, metadata: Mapping[str, str]) -
     save_tensors(path, tensors, {**metadata, **progress, "format": STATE_FORMAT})
 
 
-def load_state(path: Path, learner: JointLearner, identity: Mapping[str, str]) -> dict[str, str]:
+def load_state(path: Path, learner: Learner, identity: Mapping[str, str]) -> dict[str, str]:
     """Restore a learner and return the metadata; raises CheckpointError where `identity` differs from what was saved."""
     tensors, metadata = load_tensors(path)
     for key, value in {"format": STATE_FORMAT, **identity}.items():
