@@ -13,6 +13,7 @@ import velap.envs  # noqa: F401 - registers the tasks
 from velap.bench.evaluate import code_version
 from velap.data.minari_io import dataset_path
 from velap.errors import VelapError
+from velap.models.native import library
 from velap.tasks import TASKS
 
 PACKAGES = ("torch", "gymnasium", "mujoco", "metaworld", "minari", "numpy", "safetensors")
@@ -25,6 +26,7 @@ def describe() -> str:
         f"velap {code_version()}, Python {platform.python_version()}, {platform.platform()}",
         ", ".join(f"{name} {version(name)}" for name in PACKAGES),
         f"{os.cpu_count()} cores, {torch.get_num_threads()} torch threads, CUDA device: {cuda}",
+        "planning on the CPU: " + ("native.c" if library() else "PyTorch (native.c is off or could not be built)"),
     ]
     for task in TASKS.values():
         path = dataset_path(task.dataset_id)

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from velap.models.networks import LEAK, MLP, EnsembleMLP
 
-Forward = Callable[[Tensor], Tensor]
+Forward = Callable[..., Tensor]
 SMALLEST_GAIN = 1e-6
 """Gains are divided by; nearer to 0 than this they count as this."""
 
@@ -43,21 +43,16 @@ class Folded(NamedTuple):
 
 
 def folded_mlp(mlp: MLP, dtype: torch.dtype) -> Forward:
-    """`[*, inputs] → [*, outputs]` in the input's dtype: `mlp` in eval mode with hidden layers in `dtype`.
+    """Inputs side by side `[*, W_1], ... → [*, outputs]` in their dtype: `mlp` in eval mode, hidden layers in `dtype`.
 
     Without the tanh of a `Policy`.
     """
-    modules = list(mlp)
-    dense = []
-    for layer, following in zip(modules, [*modules[1:], None], strict=True):
-        if isinstance(layer, nn.Linear):
-            norm = following if isinstance(following, (nn.LayerNorm, nn.BatchNorm1d)) else None
-            dense.append(Dense(layer.weight.t(), layer.bias, norm))
-    layers = fold(dense)
+    layers = fold(dense_layers(mlp))
     last = Folded(*(None if part is None else part.to(dtype) for part in layers[-1]))  # type: ignore[arg-type]
     hidden = _hidden(layers[:-1], dtype, torch.addmm)
 
-    def forward(x: Tensor) -> Tensor:
+    def forward(*parts: Tensor) -> Tensor:
+        x = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
         out = torch.addmm(last.bias, hidden(x.reshape(-1, x.shape[-1])), last.weight)
         return out.to(x.dtype).view(*x.shape[:-1], out.shape[-1])
 
@@ -65,17 +60,30 @@ def folded_mlp(mlp: MLP, dtype: torch.dtype) -> Forward:
 
 
 def folded_ensemble(ensemble: EnsembleMLP, dtype: torch.dtype) -> Forward:
-    """`[*, inputs] → [n, *]` in the input's dtype, `ensemble` in eval mode with hidden layers in `dtype`."""
-    layers = fold([Dense(weight.data, bias.data, norm) for weight, bias, norm in
-                   zip(ensemble.weights, ensemble.biases, [*_member_norms(ensemble), None], strict=True)])
+    """Inputs side by side `[*, W_1], ... → [n, *]` in their dtype: `ensemble` in eval mode, hidden layers in `dtype`."""
+    layers = fold(dense_layers(ensemble))
     hidden, last = _hidden(layers[:-1], dtype, torch.baddbmm), layers[-1]
 
-    def forward(x: Tensor) -> Tensor:
+    def forward(*parts: Tensor) -> Tensor:
+        x = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
         rows = x.reshape(1, -1, x.shape[-1]).expand(ensemble.n, -1, -1)
         # Values are compared across trajectories: their last product keeps the input's precision.
         return torch.baddbmm(last.bias, hidden(rows).to(x.dtype), last.weight).view(ensemble.n, *x.shape[:-1])
 
     return forward
+
+
+def dense_layers(network: MLP | EnsembleMLP) -> list[Dense]:
+    """The layers of a network; weights [n, W, V] in an ensemble."""
+    if isinstance(network, EnsembleMLP):
+        return [Dense(weight.data, bias.data, norm) for weight, bias, norm in
+                zip(network.weights, network.biases, [*_member_norms(network), None], strict=True)]
+    modules, dense = list(network), []
+    for layer, following in zip(modules, [*modules[1:], None], strict=True):
+        if isinstance(layer, nn.Linear):
+            norm = following if isinstance(following, (nn.LayerNorm, nn.BatchNorm1d)) else None
+            dense.append(Dense(layer.weight.t(), layer.bias, norm))
+    return dense
 
 
 def _member_norms(ensemble: EnsembleMLP) -> list[nn.BatchNorm1d | tuple[Tensor, Tensor] | None]:

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from velap.models.folded import dense_layers, fold
+from velap.models.native import native_network
 from velap.models.networks import LEAK, MLP, EnsembleMLP
 
 Forward = Callable[[Tensor], Tensor]
@@ -64,6 +66,21 @@ def fast_ensemble(ensemble: EnsembleMLP) -> Forward:
         return torch.baddbmm(biases[-1], x, weights[-1]).view(ensemble.n, *prefix)
 
     return forward
+
+
+def joined(network: MLP | EnsembleMLP) -> Callable[..., Tensor]:
+    """The network on inputs side by side, `[*, W_1], [*, W_2], ...`, by `native.c` where it pays. Copies the weights.
+
+    Gives `[*, outputs]` of an MLP and `[n, *]` of an ensemble, equal in eval mode, without gradients (and without tanh).
+    """
+    fast = fast_ensemble(network) if isinstance(network, EnsembleMLP) else fast_mlp(network)
+
+    def by_torch(*parts: Tensor) -> Tensor:
+        out = fast(torch.cat(parts, -1) if len(parts) > 1 else parts[0])
+        return out.unsqueeze(-1) if isinstance(network, EnsembleMLP) else out
+
+    run = native_network(fold(dense_layers(network)), by_torch)
+    return (lambda *parts: run(*parts).squeeze(-1)) if isinstance(network, EnsembleMLP) else run
 
 
 def nearest_row(bank: Tensor) -> Callable[[Tensor], Tensor]:

@@ -18,7 +18,7 @@ from velap.config import Config, ModelConfig, Precision
 from velap.errors import CheckpointError, VelapError
 from velap.models.folded import folded_ensemble, folded_mlp
 from velap.models.generative import ConditionalVAE
-from velap.models.inference import fast_ensemble, fast_mlp, nearest_row
+from velap.models.inference import joined, nearest_row
 from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
 from velap.runs import content_sha256, load_tensors, save_tensors
 
@@ -156,11 +156,11 @@ class LatentModel(nn.Module):
 
     def _fast_functions(self, hidden: Precision | None) -> dict[str, Callable[..., Any]]:
         """h, g, π^g, Q^l and Q^g as the search calls them."""
-        decoder, local_policy = fast_mlp(self.action_model.decoder), fast_mlp(self.local_policy)
-        local_critics = fast_ensemble(self.local_critics)
+        decoder, local_policy = joined(self.action_model.decoder), joined(self.local_policy)
+        local_critics = joined(self.local_critics)
         if hidden is None:
-            dynamics, global_policy = fast_mlp(self.dynamics), fast_mlp(self.global_policy)
-            global_critic = fast_ensemble(self.global_critic)
+            dynamics, global_policy = joined(self.dynamics), joined(self.global_policy)
+            global_critic = joined(self.global_critic)
         else:
             dtype: torch.dtype = getattr(torch, hidden)
             dynamics, global_policy = folded_mlp(self.dynamics, dtype), folded_mlp(self.global_policy, dtype)
@@ -168,22 +168,21 @@ class LatentModel(nn.Module):
         residual, bound = self.config.dynamics_residual, self.bound
 
         def step(latent: Tensor, action: Tensor) -> Tensor:
-            change = dynamics(torch.cat([latent, action], -1))
+            change = dynamics(latent, action)
             return change.add_(latent) if residual else change
 
         def act_global(latent: Tensor) -> Tensor:
             return global_policy(latent).tanh_()
 
         def reach(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-            ends = torch.cat([start, goal], -1)
-            q = bound(local_critics(torch.cat([ends, local_policy(ends).tanh_()], -1)))
+            q = bound(local_critics(start, goal, local_policy(start, goal).tanh_()))
             return q.amin(0), q.std(0, correction=0)
 
         def global_q(latent: Tensor, action: Tensor) -> Tensor:
-            return bound(global_critic(torch.cat([latent, action], -1))).amin(0)
+            return bound(global_critic(latent, action)).amin(0)
 
         return {
-            "propose": lambda latent, noise: decoder(torch.cat([latent, noise], -1)).tanh_(),
+            "propose": lambda latent, noise: decoder(latent, noise).tanh_(),
             "act_global": act_global,
             "step": step,
             "reach": reach,

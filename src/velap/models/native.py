@@ -1,0 +1,145 @@
+"""`native.c`: networks on a few dozen rows, where PyTorch spends its time between the kernels.
+
+The C compiler of the machine builds it at first use, into the user's cache; without a compiler, and on other devices than a
+CPU, the networks of `inference.py` run, slower and equal up to rounding. `VELAP_NATIVE=0` turns it off. W inputs, V outputs,
+n members.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from velap.models.folded import EPS, Folded
+from velap.models.networks import LEAK
+from velap.storage import replace_file
+
+PANEL = 32
+"""Columns of a weight panel, as in native.c."""
+MOST_ROWS = 2048
+"""Rows of a call up to which one thread of native.c is at least as fast as PyTorch on two cores. ours."""
+MOST_UNITS = 4096
+"""Units of a layer up to which native.c is used: a block of rows has to fit on the stack. ours."""
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-shared", "-fPIC")
+_SOURCE = Path(__file__).with_name("native.c")
+
+
+class _Layer(ctypes.Structure):
+    """`Layer` of native.c."""
+
+    _fields_ = (("inputs", ctypes.c_long), ("outputs", ctypes.c_long), ("weights", ctypes.c_void_p),
+                ("bias", ctypes.c_void_p), ("shift", ctypes.c_void_p))
+
+
+@cache
+def library() -> ctypes.CDLL | None:
+    """The compiled code; None where it is turned off or cannot be built."""
+    compiler = next(filter(None, map(shutil.which, filter(None, (os.environ.get("CC"), "cc", "gcc", "clang")))), None)
+    if os.environ.get("VELAP_NATIVE") == "0" or compiler is None or platform.system() == "Windows":
+        return None
+    try:
+        return _declare(ctypes.CDLL(str(_build(compiler))))
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _build(compiler: str) -> Path:
+    """Path of the library for this source, compiler and processor; built when it is not there yet."""
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "velap"
+    digest = hashlib.sha256("\0".join((_SOURCE.read_text(), compiler, *FLAGS, _processor())).encode()).hexdigest()[:16]
+    path = root / f"native-{digest}.so"
+    if not path.exists():
+        root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory() as folder:
+            built = Path(folder) / "native.so"
+            subprocess.run([compiler, *FLAGS, "-o", str(built), str(_SOURCE), "-lm"], check=True, capture_output=True,
+                           timeout=60)
+            replace_file(path, built.read_bytes())
+    return path
+
+
+def _processor() -> str:
+    """What `-march=native` depends on: a cache may be shared between machines."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    named = [line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))]
+    return "\n".join([platform.machine(), platform.processor(), *sorted(set(named))])
+
+
+def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
+    number, address = ctypes.c_long, ctypes.c_void_p
+    found.velap_network.argtypes = [address, number, number, address, address, number, number, number, ctypes.c_float,
+                                    ctypes.c_float, address]
+    found.velap_network.restype = None
+    return found
+
+
+def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Inputs `[*, W_1], [*, W_2], ...`, taken side by side, → `[n, *, V]` of the members, or `[*, V]` of weights [W, V].
+
+    `otherwise` gets what native.c cannot take (other devices and types, more rows than pay) and must give the same. The
+    weights are copied.
+    """
+    found = library()
+    wide = max(max(layer.weight.shape[-2:]) for layer in layers) > MOST_UNITS
+    if found is None or wide or any(tensor.dtype != torch.float32 or tensor.device.type != "cpu"
+                            for layer in layers for tensor in (layer.weight, layer.bias)):
+        return otherwise
+    single = layers[0].weight.dim() == 2
+    members = 1 if single else len(layers[0].weight)
+    kept, structs = _pack(layers, members)
+    width = max(-(-size // PANEL) * PANEL for layer in layers for size in layer.weight.shape[-2:])
+    outputs, inputs = layers[-1].weight.shape[-1], layers[0].weight.shape[-2]
+    run, fixed = found.velap_network, (ctypes.addressof(structs), members, len(layers))
+
+    def forward(*parts: Tensor) -> Tensor:
+        prefix = parts[0].shape[:-1]
+        rows = prefix.numel()
+        if rows > MOST_ROWS or any(part.dtype != torch.float32 or part.shape[:-1] != prefix for part in parts):
+            return otherwise(*parts)
+        whole = [part.contiguous() for part in parts]
+        widths = [part.shape[-1] for part in whole]
+        assert sum(widths) == inputs
+        out = torch.empty((*prefix, outputs) if single else (members, *prefix, outputs))
+        count = len(whole)
+        run(*fixed, (ctypes.c_void_p * count)(*[part.data_ptr() for part in whole]), (ctypes.c_long * count)(*widths), count,
+            rows, width, EPS, LEAK, out.data_ptr())
+        return out
+
+    forward.kept = (kept, structs)  # type: ignore[attr-defined]  # the addresses in the structs are those of these tensors
+    return forward
+
+
+@torch.no_grad()
+def _pack(layers: Sequence[Folded], members: int) -> tuple[list[Tensor], ctypes.Array[_Layer]]:
+    """Weights in panels, and the structs that point to them, member by member."""
+    kept: list[Tensor] = []
+    structs = (_Layer * (members * len(layers)))()
+    for index, layer in enumerate(layers):
+        inputs, outputs = layer.weight.shape[-2:]
+        padded = -(-outputs // PANEL) * PANEL
+        weight = torch.zeros(members, inputs, padded)
+        weight[:, :, :outputs] = layer.weight.reshape(members, inputs, outputs)
+        panels = weight.view(members, inputs, padded // PANEL, PANEL).transpose(1, 2).contiguous()
+        vectors = []
+        for part in (layer.bias, layer.shift):
+            vectors.append(torch.zeros(members, padded))
+            if part is not None:
+                vectors[-1][:, :outputs] = part.reshape(members, outputs)
+        kept += [panels, *vectors]
+        for member in range(members):
+            shift = vectors[1][member].data_ptr() if layer.shift is not None else None
+            structs[member * len(layers) + index] = _Layer(inputs, outputs, panels[member].data_ptr(),
+                                                           vectors[0][member].data_ptr(), shift)
+    return kept, structs
