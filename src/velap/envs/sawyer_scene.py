@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from velap.envs import meshes
 from velap.envs.gl import mujoco
 from velap.envs.meshes import Array, Mesh
-from velap.envs.pixels import FRAME_SIZE, Frame, Renderer
+from velap.envs.pixels import FRAME_SIZE, Frame, shared_renderer
 
 
 @dataclass(frozen=True)
@@ -41,18 +42,26 @@ class View:
         return np.stack([right, np.cross(back, right), back])
 
 
-VIEW = View(position=(1.132, 0.083, 1.007), target=(0.068, 0.698, 0.147), fovy=36.9)
-"""ours: the view of all four tasks. It is right side up; hand targets of |x| ≤ 0.4, 0.4 ≤ y ≤ 0.95, 0.03 ≤ z ≤ 0.4 m fill it."""
+VIEW = View(position=(1.08, 0.03, 0.93), target=(0.02, 0.65, 0.07), fovy=36.5)
+"""ours: the view of all four tasks, right side up, from the right of the arm and above: it shows the fronts of the objects and
+the ways along all three axes. Finger tips at |x| ≤ 0.4, 0.34 ≤ y ≤ 0.8, 0.01 ≤ z ≤ 0.3 m and objects beyond them fill it."""
 
 CELL = 0.02
 """Side of the cubes within which vertices of a mesh are drawn together [m]. ours: 1.3 px at the middle of the view."""
 
+SMALL_MESH = 1000
+"""Meshes of up to so many triangles stay as they are. ours: those of all objects; the arm's have 2,400 and more."""
+
 STATIC_BODIES = ("tablelink", "RetainingWall", "base")
 """Bodies below the world that stand where they are in every episode: of these only what faces the camera is kept."""
+
+TEXTURE_SIZE = 128
+"""Side of a texture, at most [texels]. ours: the table is 70 px wide in the frame."""
 
 SITES = ("rightEndEffector", "leftEndEffector")
 """Sites that are drawn, red balls on the finger tips. The others mark goals, which a camera does not see."""
 
+_HIDDEN_GROUP = 5
 _SHOWN_GROUPS = 3
 """MuJoCo shows geom groups 0 to 2 unless told otherwise; Meta-World keeps its collision geoms in group 4."""
 
@@ -65,36 +74,41 @@ class Look:
     specular: float
     shininess: float
     emission: float
+    tint: tuple[int, ...] = ()
+    """Mean colour of its texture. OpenGL clamps the light before it multiplies by a texture, hence not one with rgba."""
 
 
 def _look(model: Any, material: int, rgba: Array) -> Look:
-    """What MuJoCo would draw a geom or site of this material with; textures count with their mean colour."""
+    """What MuJoCo would draw a geom or site of this material with."""
     plain = tuple(float(value) for value in rgba)
     if material < 0:
         return Look(plain, 0.5, 0.5, 0.0)
-    colour = model.mat_rgba[material].astype(float)
-    if plain != (0.5, 0.5, 0.5, 1.0):  # MuJoCo's sign of a geom without a colour of its own
-        colour = np.array(plain)
-    for texture in model.mat_texid[material]:
-        if texture >= 0:
-            colour[:3] = colour[:3] * _mean_colour(model, texture)
+    if plain == (0.5, 0.5, 0.5, 1.0):  # MuJoCo's sign of a geom without a colour of its own
+        plain = tuple(float(value) for value in model.mat_rgba[material])
     shine = model.mat_specular[material], model.mat_shininess[material], model.mat_emission[material]
-    return Look(tuple(colour.round(4).tolist()), *(float(value) for value in shine))
+    texture = _texture_of(model, material)
+    tint = () if texture < 0 else tuple(int(value) for value in _pixels(model, texture).mean((0, 1)).round())
+    return Look(plain, *(float(value) for value in shine), tint)
 
 
-def _mean_colour(model: Any, texture: int) -> Array:
-    """Mean of a texture [3] in [0, 1]."""
-    channels = int(model.tex_nchannel[texture])
-    size = int(model.tex_width[texture]) * int(model.tex_height[texture]) * channels
+def _texture_of(model: Any, material: int) -> int:
+    """The number of a material's texture, -1 without."""
+    return int(model.mat_texid[material].max()) if material >= 0 else -1
+
+
+def _pixels(model: Any, texture: int) -> NDArray[np.uint8]:
+    """A texture [H, W, channels]."""
+    shape = int(model.tex_height[texture]), int(model.tex_width[texture]), int(model.tex_nchannel[texture])
     start = int(model.tex_adr[texture])
-    return model.tex_data[start : start + size].reshape(-1, channels)[:, :3].mean(0) / 255
+    return model.tex_data[start : start + shape[0] * shape[1] * shape[2]].reshape(shape)
 
 
 def _shape(model: Any, kind: int, size: Array, mesh: int) -> Mesh | None:
     """The surface of a geom or site in its own frame; None for what is not drawn."""
     types = mujoco.mjtGeom
     if kind == types.mjGEOM_MESH.value:
-        return meshes.simplified(_stored_mesh(model, mesh), CELL)
+        surface = _stored_mesh(model, mesh)
+        return surface if len(surface) <= SMALL_MESH else meshes.simplified(surface, CELL)
     if kind == types.mjGEOM_BOX.value:
         return meshes.box(size)
     if kind == types.mjGEOM_CYLINDER.value:
@@ -138,7 +152,7 @@ def _collect(model: Any) -> dict[tuple[int, Look], Mesh]:
         found[anchor, look].append(surface.moved(turn.T @ (position - origin), turn.T @ rotation.reshape(3, 3)))
 
     for geom in range(model.ngeom):
-        if model.geom_group[geom] < _SHOWN_GROUPS and model.geom_rgba[geom][3] > 0:
+        if model.geom_group[geom] < _SHOWN_GROUPS and model.geom_rgba[geom][3] > 0 and not _is_patterned(model, geom):
             surface = _shape(model, model.geom_type[geom], model.geom_size[geom], model.geom_dataid[geom])
             look = _look(model, model.geom_matid[geom], model.geom_rgba[geom])
             add(model.geom_bodyid[geom], look, surface, data.geom_xpos[geom], data.geom_xmat[geom])
@@ -148,6 +162,12 @@ def _collect(model: Any) -> dict[tuple[int, Look], Mesh]:
             surface = _shape(model, model.site_type[site], model.site_size[site], -1)
             add(model.site_bodyid[site], look, surface, data.site_xpos[site], data.site_xmat[site])
     return {key: meshes.merged(parts) for key, parts in found.items()}
+
+
+def _is_patterned(model: Any, geom: int) -> bool:
+    """Does the geom keep its texture? The boxes of the static world do: the wood of the table shows at 64×64."""
+    boxed = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX.value
+    return bool(boxed and _anchor(model, model.geom_bodyid[geom]) == 0 and _texture_of(model, model.geom_matid[geom]) >= 0)
 
 
 def facing(mesh: Mesh, view: View) -> Mesh:
@@ -176,6 +196,7 @@ class SawyerScene:
                 continue
             _add_part(spec, body, f"part{number}", look, mesh)
         self._bodies: NDArray[np.int64] = np.array(list(anchors), dtype=np.int64)
+        _add_patterned(spec, model, view)
         _add_lights(spec, model)
         camera = spec.worldbody.add_camera(pos=view.position, fovy=view.fovy)
         mujoco.mju_mat2Quat(camera.quat, view.axes().T.ravel())
@@ -186,16 +207,30 @@ class SawyerScene:
         self.model.stat.extent, self.model.vis.map.znear, self.model.vis.map.zfar = 1.0, 0.05, 10.0
         self._data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self._data)
-        self._renderers: dict[int, Renderer] = {}
+        self._sides = _frustum(view)
+        self._assets = f"sawyer scene {next(_numbers)}"
 
     def draw(self, model: Any, data: Any, size: int = FRAME_SIZE) -> Frame:
         """The view of a state of the model, an owned uint8 [size, size, 3]."""
-        if size not in self._renderers:
-            self._renderers[size] = Renderer(self.model, size)
-        self._data.mocap_pos[:] = data.xpos[self._bodies]
-        self._data.mocap_quat[:] = data.xquat[self._bodies]
-        mujoco.mj_kinematics(self.model, self._data)
-        return self._renderers[size].draw(self.model, self._data)
+        drawn = self._data
+        drawn.mocap_pos[:] = data.xpos[self._bodies]
+        drawn.mocap_quat[:] = data.xquat[self._bodies]
+        mujoco.mj_kinematics(self.model, drawn)
+        # parts whose bounding ball is beside the frame would only cost: a hidden group takes them out
+        distances = (drawn.geom_xpos - self.view.position) @ self._sides
+        beside = (distances < -self.model.geom_rbound[:, None]).any(1)
+        self.model.geom_group[:] = np.where(beside, _HIDDEN_GROUP, 0)
+        return shared_renderer(self._assets, self.model, size).draw(self.model, drawn)
+
+
+_numbers = count()
+
+
+def _frustum(view: View) -> Array:
+    """Unit normals [3, 4] of the four sides of what the camera sees, pointing inwards."""
+    right, up, back = view.axes()
+    half = np.radians(view.fovy / 2)
+    return np.stack([sign * np.cos(half) * side - np.sin(half) * back for side in (right, up) for sign in (-1.0, 1.0)], axis=1)
 
 
 def _add_part(spec: Any, body: Any, name: str, look: Look, mesh: Mesh) -> None:
@@ -204,10 +239,47 @@ def _add_part(spec: Any, body: Any, name: str, look: Look, mesh: Mesh) -> None:
     stored.uservert = mesh.corners.ravel()
     stored.usernormal = mesh.normals.ravel()
     stored.userface = np.arange(3 * len(mesh), dtype=np.int32)
-    spec.add_material(
-        name=name, rgba=look.rgba, specular=look.specular, shininess=look.shininess, emission=look.emission
-    )
+    _add_material(spec, name, look, np.broadcast_to(np.array(look.tint, np.uint8), (1, 1, 3)) if look.tint else None)
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, contype=0, conaffinity=0)
+
+
+def _add_material(spec: Any, name: str, look: Look, pixels: NDArray[np.uint8] | None) -> None:
+    """A material, and its cube texture with all six sides alike, pixels[W, W, 3]."""
+    material = spec.add_material(name=name, rgba=look.rgba, specular=look.specular, shininess=look.shininess, emission=look.emission)
+    if pixels is not None:
+        side = len(pixels)
+        texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_CUBE, width=side, height=6 * side, nchannel=3)
+        texture.data = np.tile(pixels, (6, 1, 1)).tobytes()
+        layers = [""] * mujoco.mjtTextureRole.mjNTEXROLE
+        layers[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+        material.textures = layers
+
+
+def _add_patterned(spec: Any, model: Any, view: View) -> None:
+    """The textured boxes of the static world, as far as they show."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for geom in (geom for geom in range(model.ngeom) if _is_patterned(model, geom)):
+        position, rotation, size = data.geom_xpos[geom], data.geom_xmat[geom], model.geom_size[geom]
+        if model.geom_group[geom] >= _SHOWN_GROUPS or not len(facing(meshes.box(size).moved(position, rotation.reshape(3, 3)), view)):
+            continue
+        material = int(model.geom_matid[geom])
+        name = f"material{material}"
+        if spec.material(name) is None:
+            look = _look(model, material, model.geom_rgba[geom])
+            _add_material(spec, name, look, _shrunk(_pixels(model, _texture_of(model, material))))
+        placed = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=position, material=name)
+        placed.contype = placed.conaffinity = 0
+        mujoco.mju_mat2Quat(placed.quat, rotation)
+
+
+def _shrunk(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The first side of a cube texture [6 W, W, 3] as [W', W', 3], W' at most TEXTURE_SIZE."""
+    width = pixels.shape[1]
+    block = max(1, -(-width // TEXTURE_SIZE))
+    side = width // block
+    blocks = pixels[: side * block, : side * block].reshape(side, block, side, block, -1)
+    return blocks.mean((1, 3)).round().astype(np.uint8)
 
 
 def _add_lights(spec: Any, model: Any) -> None:
