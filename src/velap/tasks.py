@@ -79,6 +79,27 @@ TASKS: dict[str, Task] = {
                 "controller": {"n_replan": 15},
             },
         ),
+        Task(
+            name="ObstacleMaze",
+            env_id="velap/ObstacleMaze-v0",
+            entry_point="velap.envs.obstacle:ObstacleMaze",
+            max_steps=100,
+            recipe=Recipe(contexts=250, trajectories=20, max_steps=20, success_percent=0.11),
+            # Tables 7-9 give it the values that most tasks have: c1 = 0.01, n_iter 250, n_sim 5, n_replan 15
+            overrides={"model": {"frame_stack": 1}},
+            default_overrides={
+                "train": {"c1": 0.02},
+                "planner": {
+                    "n_iter": 500,
+                    "discard_low_exponent": 10.0,
+                    "p_sparse": 0.9,
+                    "p_value": 0.1,
+                    "p_policy": 0.1,
+                    "expansion_weight": 1.0,
+                    "anchor": "snap",
+                },
+            },
+        ),
     )
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, ClassVar
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap.envs.experts import follow_shortest_path
-from velap.envs.geometry import Layout, Rect
+from velap.envs.geometry import TOUCH, Layout, Rect
 from velap.envs.gl import mujoco
 from velap.envs.pixels import PixelTask
 from velap.envs.spiral import spiral_layout
@@ -48,11 +49,23 @@ def _box(rect: Rect, z: float, half_height: float, attributes: str) -> str:
     return f'<geom type="box" pos="{x:.9g} {y:.9g} {z}" size="{half_x:.9g} {half_y:.9g} {half_height}" {attributes}/>'
 
 
+def _overlaps(rect: Rect, others: Iterable[Rect]) -> list[Rect]:
+    """The parts of the rectangle that lie in others."""
+    parts = [Rect(max(rect.x_min, other.x_min), max(rect.y_min, other.y_min),
+                  min(rect.x_max, other.x_max), min(rect.y_max, other.y_max)) for other in others]
+    return [part for part in parts if part.x_max - part.x_min > TOUCH and part.y_max - part.y_min > TOUCH]
+
+
 def model_xml(layout: Layout) -> str:
-    """MuJoCo's description of a maze. The floor and the goal are paint: only walls and block touch each other."""
+    """MuJoCo's description of a maze. The floor and the goal are paint: only walls and block touch each other.
+
+    Where the goal reaches into a wall, the wall is painted too.
+    """
     paint = 'contype="0" conaffinity="0"'
     height = layout.workspace.y_max - layout.workspace.y_min
     walls = "\n".join(_box(wall, _HALF_HEIGHT, _HALF_HEIGHT, 'class="wall"') for wall in layout.walls)
+    red = f'rgba="{_COLOURS["goal"]}" {paint}'
+    red_walls = "\n".join(_box(part, 2 * _HALF_HEIGHT, 0.002, red) for part in _overlaps(layout.goal, layout.walls))
     return f"""
 <mujoco model="block maze">
   <option timestep="{CONTROL_STEP / _SUBSTEPS}" integrator="implicitfast" gravity="0 0 0" cone="pyramidal"/>
@@ -67,8 +80,8 @@ def model_xml(layout: Layout) -> str:
   <worldbody>
     <camera name="top" pos="0 0 2" orthographic="true" fovy="{height}"/>
     {_box(layout.workspace, -0.01, 0.01, f'rgba="{_COLOURS["floor"]}" {paint}')}
-    {_box(layout.goal, 0.0, 0.002, f'rgba="{_COLOURS["goal"]}" {paint}')}
-    {walls}
+    {_box(layout.goal, 0.0, 0.002, red)}
+    {walls}{red_walls}
     <body name="block" pos="0 0 {_HALF_HEIGHT}">
       <joint name="x" type="slide" axis="1 0 0"/>
       <joint name="y" type="slide" axis="0 1 0"/>

@@ -6,6 +6,7 @@ Shapes: frames are uint8 [H, W, 3], RGB, first row at the top.
 from __future__ import annotations
 
 import atexit
+import operator
 import os
 import threading
 from abc import abstractmethod
@@ -90,6 +91,14 @@ def _close(key: tuple[Any, ...]) -> None:
         _renderers.pop(key).close()
 
 
+def _number(context: Any) -> int | None:
+    """The number of a context as an int, whatever kind of integer it is; -1 where it is none."""
+    try:
+        return None if context is None else operator.index(context)
+    except TypeError:
+        return -1
+
+
 class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
     """Base of every task: frames in, bounded actions out, reward 1 on success and nothing else (Sec. 4).
 
@@ -138,9 +147,8 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
     def start(self, options: dict[str, Any] | None = None) -> None:
         """`reset` without seeding and without a frame."""
         options = options or {}
-        split, context = options.get("split", "test"), options.get("context")
-        numbered = context is None or (isinstance(context, int) and context >= 0)
-        if not (set(options) <= {"split", "context"} and split in SPLITS and numbered):
+        split, context = options.get("split", "test"), _number(options.get("context"))
+        if not set(options) <= {"split", "context"} or split not in SPLITS or (context is not None and context < 0):
             raise ConfigError(f"reset options are {options!r}; expected split, one of {SPLITS}, or context, an int from 0.")
         self._start(self.np_random, split, context)
 

@@ -11,10 +11,12 @@ from velap.envs.geometry import Layout, Rect, frame_walls, polyline_walls
 PIXEL = 1 / 32
 """Side of a pixel of the 64×64 frame on the floor [m]; the frame is 2 m wide."""
 
-_FRAME = 64
-_OUTER_WALL = 3
+FRAME = 64
+"""Side of the frame [px]."""
+OUTER_WALL = 3
+"""Thickness of the walls round the room [px]."""
 _INNER_WALL = 2
-_BLOCK = 4.5
+BLOCK = 4.5
 """Side of the block [px]. Not a whole number: without anti-aliasing its two edges then round to pixels at different places,
 so that the frame tells its position to half a pixel. It leaves 5.5 px of freedom across the corridor."""
 _INNER_CENTRELINE = ((0, 14), (50, 14), (50, 50), (14, 50), (14, 26), (38, 26), (38, 38), (26, 38))
@@ -24,20 +26,20 @@ _TEST_STARTS = (5.5, 5.5, 9.5, 10.5)
 """Block centres, in the lower left cell."""
 
 
-def _metres(rect: tuple[float, float, float, float]) -> Rect:
+def metres(rect: tuple[float, float, float, float]) -> Rect:
     """Pixels from the lower left corner -> metres from the middle."""
-    x_min, y_min, x_max, y_max = ((value - _FRAME / 2) * PIXEL for value in rect)
+    x_min, y_min, x_max, y_max = ((value - FRAME / 2) * PIXEL for value in rect)
     return Rect(x_min, y_min, x_max, y_max)
 
 
 def spiral_layout() -> Layout:
     """The one layout of SpiralMaze [m]."""
-    workspace = _metres((0, 0, _FRAME, _FRAME))
-    centreline = [((x - _FRAME / 2) * PIXEL, (y - _FRAME / 2) * PIXEL) for x, y in _INNER_CENTRELINE]
+    workspace = metres((0, 0, FRAME, FRAME))
+    centreline = [((x - FRAME / 2) * PIXEL, (y - FRAME / 2) * PIXEL) for x, y in _INNER_CENTRELINE]
     return Layout(
         workspace=workspace,
-        walls=(*frame_walls(workspace, _OUTER_WALL * PIXEL), *polyline_walls(centreline, _INNER_WALL * PIXEL)),
-        goal=_metres(_GOAL),
-        test_starts=_metres(_TEST_STARTS),
-        block_half=_BLOCK * PIXEL / 2,
+        walls=(*frame_walls(workspace, OUTER_WALL * PIXEL), *polyline_walls(centreline, _INNER_WALL * PIXEL)),
+        goal=metres(_GOAL),
+        test_starts=metres(_TEST_STARTS),
+        block_half=BLOCK * PIXEL / 2,
     )
