@@ -25,6 +25,10 @@ class Recipe:
     """Share of transitions with reward 1, as the paper reports it [%]."""
     action_noise: float = 0.3
     """Standard deviation of the Gaussian steps of the random-walk actions (C.1.1). ours: the paper gives no number."""
+    expert_radius: float = 0.0
+    """Distance to the goal within which a noisy expert acts as the expert (C.2) [m]. ours: the paper says "close"."""
+    expert_noise: float = 0.3
+    """Standard deviation of the Gaussian noise on a noisy expert's actions. ours: the paper gives no number."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,22 @@ class Task:
         """Minari id of the dataset that `velap collect` writes with seed 0."""
         return f"velap/{self.name}-v0"
 
+
+_SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
+    "model": {"frame_stack": 1},
+    "train": {"c1": 0.02},
+    "planner": {
+        "n_iter": 500,
+        "discard_low_exponent": 20.0,
+        "p_sparse": 0.9,
+        "p_value": 0.1,
+        "p_policy": 0.1,
+        "expansion_weight": 1.0,
+        "anchor": "snap",
+    },
+    "controller": {"n_replan": 15},
+}
+"""ours: the manipulation tasks plan like SpiralMaze does by default."""
 
 TASKS: dict[str, Task] = {
     task.name: task
@@ -99,6 +119,53 @@ TASKS: dict[str, Task] = {
                     "anchor": "snap",
                 },
             },
+        ),
+        Task(
+            name="WindowClose",
+            env_id="velap/WindowClose-v0",
+            entry_point="velap.envs.sawyer_tasks:WindowClose",
+            max_steps=150,
+            recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.48, expert_radius=0.2),
+            overrides={
+                "train": {"c3": 0.5},
+            },
+            default_overrides=_SAWYER_DEFAULTS,
+        ),
+        Task(
+            name="FaucetClose",
+            env_id="velap/FaucetClose-v0",
+            entry_point="velap.envs.sawyer_tasks:FaucetClose",
+            max_steps=150,
+            recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.31, expert_radius=0.2),
+            overrides={
+                "train": {"c3": 0.5},
+            },
+            default_overrides=_SAWYER_DEFAULTS,
+        ),
+        Task(
+            name="ButtonWall",
+            env_id="velap/ButtonWall-v0",
+            entry_point="velap.envs.sawyer_tasks:ButtonWall",
+            max_steps=250,
+            recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.16, expert_radius=0.2),
+            overrides={
+                "train": {"c3": 0.5},
+                "planner": {"n_iter": 500, "n_sim": 10},
+                "controller": {"n_replan": 25},
+            },
+            default_overrides=_SAWYER_DEFAULTS,
+        ),
+        Task(
+            name="DrawerButton",
+            env_id="velap/DrawerButton-v0",
+            entry_point="velap.envs.sawyer_tasks:DrawerButton",
+            max_steps=150,
+            recipe=Recipe(contexts=150, trajectories=20, max_steps=50, success_percent=0.16, expert_radius=0.2),
+            overrides={
+                "train": {"c3": 0.5},
+                "planner": {"n_sim": 10},
+            },
+            default_overrides=_SAWYER_DEFAULTS,
         ),
     )
 }

@@ -6,7 +6,7 @@ Letters: T transitions of one trajectory (it has T + 1 frames), A action entries
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -37,9 +37,49 @@ def random_walk(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Polic
     return act
 
 
-BEHAVIOURS: dict[str, Behaviour] = {"random-walk": random_walk}
+@runtime_checkable
+class ScriptedTask(Protocol):
+    """What `noisy_expert` asks of an environment."""
+
+    def in_test_region(self) -> bool:
+        """Is the agent where test episodes start?"""
+
+    def expert_distance(self) -> float:
+        """Distance to what the expert acts on in the data [m]; infinite where it stays silent."""
+
+    def expert_action(self) -> np.ndarray:
+        """The expert's action [A]."""
+
+
+def noisy_expert(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Policy:
+    """The random walk; within `recipe.expert_radius` of the goal the expert, with Gaussian noise of `recipe.expert_noise`.
+
+    Once the agent has been where test episodes start, the expert stays silent for the rest of the trajectory: what leads
+    from there to success has to be stitched together (C.2).
+    """
+    space, task = env.action_space, env.unwrapped
+    assert isinstance(space, gym.spaces.Box) and isinstance(task, ScriptedTask)
+    walk, silent = random_walk(env, recipe, rng), False
+
+    def act(frame: np.ndarray) -> np.ndarray:
+        nonlocal silent
+        silent = silent or task.in_test_region()
+        if silent or task.expert_distance() > recipe.expert_radius:
+            return walk(frame)
+        noise = rng.normal(0.0, recipe.expert_noise, space.shape)
+        return np.clip(task.expert_action() + noise, space.low, space.high).astype(np.float32)
+
+    return act
+
+
+BEHAVIOURS: dict[str, Behaviour] = {"random-walk": random_walk, "noisy-expert": noisy_expert}
 """Behaviours by name."""
-MIXTURES: dict[str, Mapping[str, float]] = {}
+MIXTURES: dict[str, Mapping[str, float]] = {
+    "WindowClose": {"random-walk": 0.25, "noisy-expert": 0.75},
+    "FaucetClose": {"random-walk": 0.52, "noisy-expert": 0.48},
+    "ButtonWall": {"random-walk": 0.83, "noisy-expert": 0.17},
+    "DrawerButton": {"random-walk": 0.5, "noisy-expert": 0.5},
+}
 """Share of trajectories of each behaviour, by task; tasks that are not named use the random walk alone."""
 
 
