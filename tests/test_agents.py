@@ -1,4 +1,4 @@
-"""Agents: conformance over the registry, and Algorithm 2 step by step on the exact toy world."""
+"""Reactive agents, and Algorithm 2 step by step on the exact toy world; what agents share is in test_agents_conformance."""
 
 from __future__ import annotations
 
@@ -8,60 +8,14 @@ import torch
 
 from toy_env import ACTION_SCALE, SIDE, ToyEnv, ToyModel, draw, toy_config
 from toy_world import DISCOUNT, START
-from velap.agents.base import METHODS, make_agent
+from velap.agents.base import make_agent
 from velap.agents.velap import VelapAgent
 from velap.config import override
-from velap.errors import UnknownTaskError
 
 
 def frames_at(*positions: tuple[float, float]) -> np.ndarray:
     """Stacked frames [B, 2, SIDE, SIDE, 3] of blocks at rest."""
     return np.stack([np.stack([draw(np.array(position))] * 2) for position in positions])
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_conformance(method: str) -> None:
-    agent = make_agent(method, ToyModel(), toy_config(), ToyEnv().action_space)
-    assert (agent.method, agent.frame_stack) == (method, 2)
-    frames = frames_at(START, (3.0, 0.0), (0.0, 9.0))
-    seeds = np.array([5, 6, 7])
-
-    def play() -> np.ndarray:
-        agent.reset(np.ones(3, bool), seeds)
-        return np.stack([agent.act(frames) for _ in range(3)])
-
-    first = play()
-    assert first.shape == (3, 3, 2)
-    assert first.dtype == np.float32
-    assert np.abs(first).max() <= ACTION_SCALE
-    assert agent.last_plan_ms.shape == (3,)
-    np.testing.assert_array_equal(first, play())
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_reset_of_one_row_leaves_the_others(method: str) -> None:
-    agents = [make_agent(method, ToyModel(), toy_config(), ToyEnv().action_space) for _ in range(2)]
-    frames = frames_at(START, (-5.0, 2.0))
-    for agent in agents:
-        agent.reset(np.ones(2, bool), np.array([1, 2]))
-        agent.act(frames)
-    agents[0].reset(np.array([True, False]), np.array([9, 9]))
-    for _ in range(3):
-        np.testing.assert_array_equal(agents[0].act(frames)[1], agents[1].act(frames)[1])
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_act_without_reset(method: str) -> None:
-    agent = make_agent(method, ToyModel(), toy_config(), ToyEnv().action_space)
-    assert agent.act(frames_at(START)).shape == (1, 2)
-    assert agent.act(frames_at(START, START)).shape == (2, 2)
-
-
-def test_unknown_method_is_named() -> None:
-    with pytest.raises(UnknownTaskError, match=r"'mcts'.*velap, td3bc, random"):
-        make_agent("mcts", None, toy_config(), ToyEnv().action_space)
-    with pytest.raises(UnknownTaskError, match="--checkpoint"):
-        make_agent("velap", None, toy_config(), ToyEnv().action_space)
 
 
 def test_random_actions_fill_the_box() -> None:

@@ -78,6 +78,8 @@ class ToyModel(nn.Module):
         self._fns = toy_fns(**changes)
         self.encoded_batches: list[int] = []
 
+    action_dim = 2
+
     def encode(self, frames: Tensor) -> Tensor:
         self.encoded_batches.append(len(frames))
         return read(frames)
@@ -97,7 +99,7 @@ class ToyModel(nn.Module):
     def to_env(self, action: Tensor) -> np.ndarray:
         return (ACTION_SCALE * action).numpy().astype(np.float32)
 
-    def search_fns(self, neighbour_distance_factor: float = 3.0) -> dict[str, object]:
+    def search_fns(self, neighbour_distance_factor: float = 3.0, hidden: str | None = None) -> dict[str, object]:
         return self._fns._asdict()
 
 

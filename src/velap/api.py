@@ -106,42 +106,49 @@ def _is_finished(checkpoint: Path, config: Config, seed: int, dataset_hash: str)
     return saved == config and metadata["seed"] == str(seed) and metadata["dataset_hash"] == dataset_hash
 
 
-def load(checkpoint: Path | str, method: str = "velap", device: str = "auto") -> Agent:
+def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", head: Path | str | None = None) -> Agent:
     """An agent that acts by a checkpoint: `reset(mask, seeds)` at the start of episodes, then `act(frames)`.
 
     Args:
         checkpoint: `model.safetensors` of a run.
-        method: `velap`, or `td3bc` for π^g alone.
+        method: one of `velap.agents.base.METHODS`, such as `velap`, or `td3bc` for π^g alone.
         device: `auto`, `cpu` or `cuda`.
+        head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
     """
     from velap.agents.base import make_agent
+    from velap.models.heads import HEADS, head_path, load_head
     from velap.models.latent import load_checkpoint
     from velap.training.loop import pick_device
 
-    model, config, _ = load_checkpoint(Path(checkpoint), pick_device(device))
+    model, config, metadata = load_checkpoint(Path(checkpoint), pick_device(device))
+    learnt = None
+    if method in HEADS:
+        learnt = load_head(head or head_path(checkpoint, method), metadata, pick_device(device))
     bounds = np.array([model.spaces.action_low, model.spaces.action_high], np.float32)
-    return make_agent(method, model, config, gym.spaces.Box(bounds[0], bounds[1], dtype=np.float32))
+    return make_agent(method, model, config, gym.spaces.Box(bounds[0], bounds[1], dtype=np.float32), learnt)
 
 
 def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,
              first_seed: int = 0, env: str | None = None, records: Path | str = RECORDS, fresh: bool = False,
-             device: str = "auto") -> Summary:
+             device: str = "auto", head: Path | str | None = None) -> Summary:
     """Success rate and more over seeded test episodes; goes on where an earlier call with the same records stopped.
 
     Args:
         task: task name; with `env`, any label.
         checkpoint: `model.safetensors` of a run; `random` needs none.
-        method: `velap`, `td3bc` or `random`.
+        method: one of `velap.agents.base.METHODS`.
         episodes: number of episodes.
         first_seed: seed of the first one; test seeds are 0 to 99.
         env: any Gymnasium id instead of the task's own environment.
         records: root of the record files.
         fresh: move an existing record file aside first.
         device: `auto`, `cpu` or `cuda`.
+        head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
     """
     from velap.bench.evaluate import Evaluation
     from velap.bench.evaluate import evaluate as run
     from velap.bench.report import summarise
 
-    what = Evaluation(task, method, Path(checkpoint) if checkpoint is not None else None, env=env, device=device)
+    what = Evaluation(task, method, Path(checkpoint) if checkpoint is not None else None, env=env, device=device,
+                      head=Path(head) if head is not None else None)
     return summarise(run(what, range(first_seed, first_seed + episodes), Path(records), fresh=fresh))

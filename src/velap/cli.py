@@ -6,7 +6,7 @@ import ast
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,7 +22,10 @@ ERR = Console(stderr=True, highlight=False)
 
 Task = Annotated[Positional[str], arg(help="Task name, see `velap info`.")]
 Preset = Annotated[Literal["default", "paper"], arg(help="`paper` is Tables 2-10 alone, `default` what measured best.")]
-Method = Annotated[Literal["velap", "td3bc", "random"], arg(help="VELAP, π^g alone, or uniform actions.")]
+Method = Annotated[
+    Literal["velap", "bc", "bc-success", "td3bc", "iql", "iql-sparse", "mppi", "mbop", "iris", "iris-multistep", "random"],
+    arg(help="VELAP, a baseline of Table 1 (`td3bc` is π^g alone, `iql-sparse` is IQL as its authors set it for sparse "
+             "rewards), or uniform actions.")]
 Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="`auto` takes CUDA where there is one.")]
 Settings = Annotated[tuple[str, ...], arg(name="set", help="Config fields to replace, such as `planner.n_iter=500`.")]
 Records = Annotated[Path, arg(help="Root of the episode records.")]
@@ -94,7 +97,7 @@ def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str
 def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap", episodes: int = 100, first_seed: int = 0,
              env: str | None = None, image_key: str | None = None, max_steps: int | None = None, preset: Preset = "default",
              records: Records = Path("results/records"), fresh: bool = False, batch: int = 10, video: bool = False,
-             device: Device = "auto", settings: Settings = ()) -> None:
+             device: Device = "auto", settings: Settings = (), head: Path | None = None) -> None:
     """Run seeded test episodes and record each; repeat the command to go on where it stopped.
 
     Args:
@@ -107,10 +110,13 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
         fresh: Move an existing record file aside first.
         batch: Environments at once.
         video: Film the first episode as well.
+        head: What the method learnt; METHOD.safetensors beside the checkpoint unless said.
     """
+    from velap.agents.base import SETTINGS
     from velap.bench.evaluate import Evaluation
 
-    what = Evaluation(task, method, checkpoint, preset, env, image_key, max_steps, device, parse_settings(settings))
+    changes = parse_settings(settings, {method: SETTINGS[method]} if method in SETTINGS else {})
+    what = Evaluation(task, method, checkpoint, preset, env, image_key, max_steps, device, changes, head)
     _evaluate(what, range(first_seed, first_seed + episodes), records, fresh, batch, video)
 
 
@@ -229,25 +235,29 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 PARTS = ("model", "train", "planner", "controller")
 
 
-def parse_settings(settings: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """`["planner.n_iter=500"]` -> `{"planner": {"n_iter": 500}}`; raises ConfigError on any other form."""
+def parse_settings(settings: Sequence[str], further: Mapping[str, object] | None = None) -> dict[str, dict[str, Any]]:
+    """`["planner.n_iter=500"]` -> `{"planner": {"n_iter": 500}}`; raises ConfigError on any other form.
+
+    `further` parts beside those of the config, such as a method's own settings, with their defaults.
+    """
+    parts = {**{part: getattr(Config(task="", preset=""), part) for part in PARTS}, **(further or {})}
     changes: dict[str, dict[str, Any]] = {}
     for setting in settings:
         name, equals, text = setting.partition("=")
         part, dot, field = name.partition(".")
-        if not (equals and dot and part in PARTS):
-            raise ConfigError(f"--set got {setting!r}; expected PART.FIELD=VALUE; parts are {', '.join(PARTS)}.")
+        if not (equals and dot and part in parts):
+            raise ConfigError(f"--set got {setting!r}; expected PART.FIELD=VALUE; parts are {', '.join(parts)}.")
         try:
             value = ast.literal_eval(text)
         except (ValueError, SyntaxError):
             value = text
-        changes.setdefault(part, {})[field] = _as_type_of_default(part, field, value)
+        changes.setdefault(part, {})[field] = _as_type_of_default(parts[part], part, field, value)
     return changes
 
 
-def _as_type_of_default(part: str, field: str, value: Any) -> Any:
-    """`value` in the type of the field's default; unknown fields pass, `override` names them."""
-    default = getattr(getattr(Config(task="", preset=""), part), field, None)
+def _as_type_of_default(defaults: object, part: str, field: str, value: Any) -> Any:
+    """`value` in the type of the field's default; unknown fields pass, what takes the changes names them."""
+    default = getattr(defaults, field, None)
     if isinstance(default, float) and isinstance(value, int):
         return float(value)
     if default is not None and type(value) is not type(default):

@@ -1,12 +1,14 @@
-"""Agents that look at the current state only: uniform random actions, and π^g alone (TD3-BC of Table 1)."""
+"""Agents that look at the current state only: uniform random actions, π^g alone (TD3-BC), and the policies of BC and IQL."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from velap.agents.base import masked_seeds
 
@@ -45,18 +47,18 @@ class RandomAgent:
 
 
 class ReactiveAgent:
-    """π^g at every step: the model-free policy that VELAP plans over, called TD3-BC in Table 1."""
+    """One policy of the latent state at every step: π^g of the joint checkpoint (TD3-BC, D.2), or a head's (D.1, D.3)."""
 
-    method = "td3bc"
-
-    def __init__(self, model: LatentModel, frame_stack: int) -> None:
+    def __init__(self, method: str, model: LatentModel, policy: Callable[[Tensor], Tensor], frame_stack: int) -> None:
+        self.method = method
         self.frame_stack = frame_stack
         self.last_plan_ms: NDArray[np.float64] = np.empty(0)
         self._model = model
+        self._policy = policy
         self._device = next(model.parameters()).device
 
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
-        """Nothing to forget: π^g is a function of the state."""
+        """Nothing to forget: the policy is a function of the state."""
         self.last_plan_ms = np.full(len(mask), np.nan)
 
     @torch.inference_mode()
@@ -65,4 +67,4 @@ class ReactiveAgent:
         if len(frames) != len(self.last_plan_ms):
             self.reset(np.ones(len(frames), bool))
         latents = self._model.encode(torch.from_numpy(frames).to(self._device))
-        return self._model.to_env(self._model.act_global(latents))
+        return self._model.to_env(self._policy(latents))

@@ -7,19 +7,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 import velap.envs  # noqa: F401 - registers the tasks
 from velap._version import __version__
-from velap.agents.base import Agent, make_agent
+from velap.agents.base import Agent, Settings, check_method, make_agent, method_hash, method_settings
 from velap.bench.records import Record, RecordFile, RunKey, select
 from velap.bench.rollout import Episode, FrameReader, Observer, Rollout, make_envs
 from velap.config import Config
 from velap.data.images import IMAGE_SIZE
 from velap.errors import ConfigError, UnknownTaskError
+from velap.models.heads import HEADS, AnyHead, head_path, load_head
 from velap.models.latent import WEIGHTS_SHA256, LatentModel, load_checkpoint
 from velap.tasks import TASKS, get_task, make_config
 
@@ -46,7 +47,10 @@ class Evaluation:
     """Time limit where the environment has none [steps]."""
     device: str = "auto"
     changes: dict[str, dict[str, Any]] | None = None
-    """Fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`."""
+    """Fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`, or of the method's own settings,
+    `{"mppi": {"temperature": 1.0}}`."""
+    head: Path | None = None
+    """What the method learnt beside the checkpoint; None looks for `<method>.safetensors` in the checkpoint's folder."""
 
 
 @dataclass(frozen=True)
@@ -78,33 +82,60 @@ def load_player(what: Evaluation) -> Player:
     """Load the checkpoint, make the agent and check that it fits the environment."""
     task_env = TASKS[what.task].env_id if what.task in TASKS else None
     env_id = what.env or get_task(what.task).env_id
-    model, config, seed, digest = _load_model(what)
+    check_method(what.method)
+    loaded = _load_model(what)
+    model, config = loaded.model, loaded.config
     if what.env is None and config.task != what.task:
         raise ConfigError(f"{what.checkpoint} was trained on {config.task!r}, not on {what.task!r}; evaluate it with "
                           f"`velap evaluate {config.task}`, or name an environment with --env.")
     env = make_env(env_id)
     try:
-        agent = make_agent(what.method, model, config, _checked_actions(env, model))
+        agent = make_agent(what.method, model, config, _checked_actions(env, model), loaded.head, loaded.settings)
     finally:
         env.close()
-    key = RunKey(task=what.task if env_id == task_env else env_id, method=what.method, preset=config.preset, train_seed=seed,
-                 env=env_id, config_hash=config.hash(), checkpoint=digest, code_version=code_version())
+    key = RunKey(task=what.task if env_id == task_env else env_id, method=what.method, preset=config.preset,
+                 train_seed=loaded.seed, env=env_id,
+                 config_hash=method_hash(config, what.method, loaded.head, loaded.settings), checkpoint=loaded.digest,
+                 code_version=code_version())
     size = model.spaces.height if model is not None else IMAGE_SIZE
     return Player(agent, model, config, key, lambda: make_env(env_id), size, what.image_key, what.max_steps)
 
 
-def _load_model(what: Evaluation) -> tuple[LatentModel | None, Config, int, str]:
-    """Model, config, training seed and hash of the checkpoint; a bare config for `random`."""
+class _Loaded(NamedTuple):
+    """What an evaluation reads from disk, and how the method plans."""
+
+    model: LatentModel | None
+    config: Config
+    seed: int
+    """Training seed."""
+    digest: str
+    """Hash of the joint weights."""
+    head: AnyHead | None = None
+    settings: Settings | None = None
+
+
+def _load_model(what: Evaluation) -> _Loaded:
+    """Checkpoint, head and settings of the method; a bare config for `random`."""
     from velap.config import override
     from velap.training.loop import pick_device
 
+    changes = dict(what.changes or {})
+    settings = method_settings(what.method, changes.pop(what.method, None))
+    if what.head is not None and what.method not in HEADS:
+        raise ConfigError(f"method {what.method!r} learns no head and got {what.head}; expected one of {', '.join(HEADS)}. "
+                          "Leave --head out, or name that method.")
     if what.method == "random":
-        return None, make_config(what.task, what.preset), 0, ""
+        return _Loaded(None, make_config(what.task, what.preset), 0, "")
     if what.checkpoint is None:
         raise ConfigError(f"method {what.method!r} acts by a trained model and got none; name one with --checkpoint, or "
                           f"train one with `velap train {what.task}`.")
-    model, config, metadata = load_checkpoint(what.checkpoint, pick_device(what.device))
-    return model, override(config, **(what.changes or {})), int(metadata.get("seed", 0)), metadata[WEIGHTS_SHA256]
+    device = pick_device(what.device)
+    model, config, metadata = load_checkpoint(what.checkpoint, device)
+    head = None
+    if what.method in HEADS:
+        head = load_head(what.head or head_path(what.checkpoint, what.method), metadata, device)
+    seed = int(metadata.get("seed", 0))
+    return _Loaded(model, override(config, **changes), seed, metadata[WEIGHTS_SHA256], head, settings)
 
 
 def make_env(env_id: str) -> gym.Env[Any, Any]:
