@@ -230,18 +230,26 @@ def meta_world(backend: str) -> Iterator[Callable[[int], float] | None]:
 
 
 def env_steps_per_s(device: torch.device) -> Measurement:
-    """Environment steps with their 64 × 64 frame; Meta-World's are another task, a manipulator of meshes."""
-    from velap.envs.pixels import shared_renderer
+    """Steps of SpiralMaze with their 64 × 64 frame; Meta-World's are another task, a manipulator of meshes."""
+    return _env_steps_per_s(TASK, "another task: ")
 
-    env: gym.Env[Any, Any] = gym.make(f"velap.envs:{get_task(TASK).env_id}")
+
+def sawyer_env_steps_per_s(device: torch.device) -> Measurement:
+    """Steps of WindowClose with their 64 × 64 frame; Meta-World's are the same physics drawn by its own `render()`."""
+    return _env_steps_per_s("WindowClose", "")
+
+
+def _env_steps_per_s(name: str, note: str) -> Measurement:
+    """Environment steps of a task with their frame, random actions, against Meta-World's step and render in turns."""
+    from velap.envs.gl import working_backend
+
+    env: gym.Env[Any, Any] = gym.make(f"velap.envs:{get_task(name).env_id}")
     env.action_space.seed(0)
     env.reset(seed=0)
-    task: Any = env.unwrapped
-    backend = shared_renderer(task.assets, task.model, 64).backend
-    steps, reference_steps, repeats = 300, 12, 5
+    steps, reference_steps, repeats = min(300, get_task(name).max_steps), 12, 5
     times: list[float] = []
     reference_times: list[float] = []
-    with meta_world(backend) as reference:
+    with meta_world(working_backend()) as reference:
         for _ in range(repeats + 1):
             env.reset()
             began = time.perf_counter()
@@ -251,10 +259,45 @@ def env_steps_per_s(device: torch.device) -> Measurement:
             if reference is not None:
                 reference_times.append(reference(reference_steps) / reference_steps)
     env.close()
-    name = f"another task: Meta-World's window-close-v3, step + render(64 × 64), {backend}"
+    described = f"{note}Meta-World's window-close-v3, step + render(64 × 64), {working_backend()}"
     if reference is None:
-        return Measurement(1 / statistics.median(times[1:]), "steps/s", f"{name}; it does not run here", None)
-    return Measurement(1 / statistics.median(times[1:]), "steps/s", name, 1 / statistics.median(reference_times[1:]))
+        return Measurement(1 / statistics.median(times[1:]), "steps/s", f"{described}; it does not run here", None)
+    return Measurement(1 / statistics.median(times[1:]), "steps/s", described, 1 / statistics.median(reference_times[1:]))
+
+
+COLLECTED_CONTEXTS = 20
+"""Contexts of WindowClose that `collect_frames_per_s` collects, of 200."""
+
+
+def collect_frames_per_s(device: torch.device) -> Measurement:
+    """`velap collect WindowClose` on all cores, from the start of its processes to the written dataset with its card.
+
+    The bound: 100,000 frames in 10 minutes on 2 cores.
+    """
+    from velap.data.collect import collect
+
+    task = get_task("WindowClose")
+    short = replace(task, recipe=replace(task.recipe, contexts=COLLECTED_CONTEXTS))
+    with TemporaryDirectory() as folder, _datasets_in(folder):
+        result = collect(short, dataset_id="bench/collected-v0")
+    cores = len(os.sched_getaffinity(0))
+    return Measurement((result.transitions + result.episodes) / result.seconds, "frames/s",
+                       f"the bound: 100,000 frames in 10 minutes; {COLLECTED_CONTEXTS} contexts of WindowClose, {cores} cores",
+                       100_000 / 600)
+
+
+@contextmanager
+def _datasets_in(folder: str) -> Iterator[None]:
+    """Minari's datasets lie in `folder` for a while."""
+    key = "MINARI_DATASETS_PATH"
+    before = os.environ.get(key)
+    os.environ[key] = folder
+    try:
+        yield
+    finally:
+        os.environ.pop(key)
+        if before is not None:
+            os.environ[key] = before
 
 
 def train_rss(device: torch.device) -> Measurement:

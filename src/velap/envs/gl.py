@@ -37,7 +37,14 @@ try:
 except Exception as error:  # PyOpenGL and ctypes fail in many ways where a library is missing
     raise render_error(f"MuJoCo cannot be imported: {type(error).__name__}: {error}") from error
 
-__all__ = ["BACKENDS", "backend_order", "make_context", "mujoco", "render_error"]
+__all__ = ["BACKENDS", "backend_order", "make_context", "mujoco", "render_error", "working_backend"]
+
+
+def working_backend() -> str:
+    """The backend that draws in this process; raises RenderError before the first frame."""
+    if not _working:
+        raise render_error("nothing has been drawn yet in this process")
+    return _working[0]
 
 
 def backend_order() -> tuple[str, ...]:
