@@ -49,20 +49,27 @@ BENCHMARKS: dict[str, Benchmark] = {
     "plan_latency_1_sim5": Benchmark(benchmarks.plan_latency_1_sim5, at_most=1 / 50),
     "plan_latency_64": Benchmark(benchmarks.plan_latency_64, at_most=1 / 50),
     "env_steps_per_s": Benchmark(benchmarks.env_steps_per_s, at_least=10),
+    "sawyer_env_steps_per_s": Benchmark(benchmarks.sawyer_env_steps_per_s, at_least=10),
+    "collect_frames_per_s": Benchmark(benchmarks.collect_frames_per_s, at_least=1),
     "train_rss": Benchmark(benchmarks.train_rss, at_most=1),
 }
 
 
 def machine(device: torch.device) -> str:
     """What the numbers were measured on."""
+    gpu = f", {torch.cuda.get_device_name(device)}" if device.type == "cuda" else ""
+    return (f"{hardware()}, {torch.get_num_threads()} threads{gpu}, "
+            f"torch {torch.__version__}, Python {platform.python_version()}, {platform.system()}")
+
+
+def hardware() -> str:
+    """Processor and number of cores that this process may use."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         named = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         model = named[0].partition(":")[2].strip() if named else model
-    gpu = f", {torch.cuda.get_device_name(device)}" if device.type == "cuda" else ""
-    return (f"{model}, {len(os.sched_getaffinity(0))} cores, {torch.get_num_threads()} threads{gpu}, "
-            f"torch {torch.__version__}, Python {platform.python_version()}, {platform.system()}")
+    return f"{model}, {len(os.sched_getaffinity(0))} cores"
 
 
 def run_benchmarks(console: Console, json_path: Path | None = None, device: str = "auto",
