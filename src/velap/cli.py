@@ -205,18 +205,25 @@ def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device =
     run_benchmarks(OUT, json, device, only)
 
 
-def study(subject: Annotated[Positional[Literal["faults"]], arg(help="`faults`: kills, damage, full disks.")],
-          quick: bool = False, seed: int = 0, write: Path | None = None) -> None:
-    """Try what may go wrong, on a task shrunk to seconds, and report what came of it.
+def study(subject: Annotated[Positional[Literal["faults", "experts"]],
+                             arg(help="`faults`: kills, damage, full disks. `experts`: can the tasks be solved.")],
+          quick: bool = False, seed: int = 0, write: Path | None = None, json: Path | None = None) -> None:
+    """Try what may go wrong, on a task shrunk to seconds; or try whether each task can be solved, and not by chance.
 
     Args:
-        quick: Two kills a command instead of twenty.
-        seed: Decides the moments of the kills.
-        write: Document to write, such as docs/faults.md.
+        quick: Two kills a command instead of twenty; ten episodes a task instead of a hundred.
+        seed: Decides the moments of the kills; seed of the experts' first episode.
+        write: Document to write, such as docs/faults.md or docs/experts.md.
+        json: Figures of the experts go to this file as well, such as results/experts.json.
     """
-    from velap.bench.study import study_faults
+    if subject == "faults":
+        from velap.bench.study import study_faults
 
-    study_faults(OUT, quick, seed, write)
+        study_faults(OUT, quick, seed, write)
+    else:
+        from velap.bench.experts import study_experts
+
+        study_experts(OUT, quick, seed, write, json)
 
 
 def info() -> None:

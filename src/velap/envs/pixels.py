@@ -140,12 +140,12 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
         `context`: the number of an initialisation of all but the agent (Table 10), by default drawn anew. Tasks with one
         context ignore it.
         """
-        super().reset(seed=seed)
-        self.start(options)
+        self.start(options, seed)
         return self.render(), {"success": False}
 
-    def start(self, options: dict[str, Any] | None = None) -> None:
-        """`reset` without seeding and without a frame."""
+    def start(self, options: dict[str, Any] | None = None, seed: int | None = None) -> None:
+        """`reset` without a frame."""
+        super().reset(seed=seed)
         options = options or {}
         split, context = options.get("split", "test"), _number(options.get("context"))
         if not set(options) <= {"split", "context"} or split not in SPLITS or (context is not None and context < 0):
