@@ -55,7 +55,6 @@ class Task:
 
 
 _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
-    "model": {"frame_stack": 1},
     "train": {"c1": 0.02},
     "planner": {
         "n_iter": 500,

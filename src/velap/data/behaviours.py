@@ -75,9 +75,9 @@ def noisy_expert(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Poli
 BEHAVIOURS: dict[str, Behaviour] = {"random-walk": random_walk, "noisy-expert": noisy_expert}
 """Behaviours by name."""
 MIXTURES: dict[str, Mapping[str, float]] = {
-    "WindowClose": {"random-walk": 0.25, "noisy-expert": 0.75},
-    "FaucetClose": {"random-walk": 0.52, "noisy-expert": 0.48},
-    "ButtonWall": {"random-walk": 0.83, "noisy-expert": 0.17},
+    "WindowClose": {"random-walk": 0.36, "noisy-expert": 0.64},
+    "FaucetClose": {"random-walk": 0.39, "noisy-expert": 0.61},
+    "ButtonWall": {"random-walk": 0.87, "noisy-expert": 0.13},
     "DrawerButton": {"random-walk": 0.5, "noisy-expert": 0.5},
 }
 """Share of trajectories of each behaviour, by task; tasks that are not named use the random walk alone."""

@@ -77,10 +77,10 @@ def press_behind_wall(task: ButtonWall) -> Action:
     if hand[1] > wall[1] + 0.06:
         return press(mocap, hand, button)
     side = 1.0 if hand[0] >= wall[0] else -1.0
-    past = wall[0] + side * (task.wall_half_width + 0.06)
+    past = wall[0] + side * (task.wall_half_width + 0.05)
     height = button[2] + 0.03
     if (past - hand[0]) * side > 0.015:  # still in the lee of the wall
-        return go(mocap, np.array([past + side * 0.01, min(mocap[1], wall[1] - 0.1), height]))
+        return go(mocap, np.array([past + side * 0.005, min(mocap[1], wall[1] - 0.1), height]))
     return go(mocap, np.array([past, wall[1] + 0.1, height]))
 
 

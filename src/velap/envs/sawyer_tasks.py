@@ -66,7 +66,7 @@ class WindowClose(_NearOrAnywhere):
     contexts = Box((-0.08, 0.75, 0.2), (0.08, 0.88, 0.2))
     """Where the window stands."""
     data_starts = hand_limits
-    test_starts = Box((-0.38, 0.42, 0.1), (-0.26, 0.6, 0.28))
+    test_starts = Box((-0.36, 0.42, 0.08), (-0.24, 0.6, 0.22))
     """Left of the window: round the handle and back with it are more than 50 steps."""
     near_share = 0.6
     near_box = (0.15, 0.15, 0.12)
@@ -103,7 +103,7 @@ class FaucetClose(_NearOrAnywhere):
     contexts = Box((-0.05, 0.76, 0.0), (0.15, 0.85, 0.0))
     """Where the faucet stands."""
     data_starts = hand_limits
-    test_starts = Box((-0.38, 0.42, 0.1), (-0.3, 0.6, 0.28))
+    test_starts = Box((-0.38, 0.42, 0.08), (-0.3, 0.6, 0.22))
     """Left of the faucet, whose handle is pushed from the right."""
     near_share = 0.4
     near_box = (0.15, 0.15, 0.12)
@@ -149,12 +149,12 @@ class ButtonWall(SawyerTask):
     assets: ClassVar[str] = "button-wall"
     hand_limits = Box((-0.4, 0.34, 0.06), (0.4, 0.8, 0.16))
     """The upper limit of z keeps the finger tips 6 cm and more below the wall's top."""
-    wall_half_width = 0.2
+    wall_half_width = 0.23
     wall_half_height = 0.09
     wall_half_depth = 0.015
-    boxes = Box((-0.08, 0.9, 0.115), (0.08, 0.94, 0.115))
+    boxes = Box((-0.06, 0.9, 0.115), (0.06, 0.94, 0.115))
     """Where the box with the button stands."""
-    wall_shift = 0.04
+    wall_shift = 0.03
     """The wall's middle is at most so far beside the button: no short cut round either end."""
     wall_ys = (0.49, 0.53)
     front_share = 0.5
@@ -240,7 +240,7 @@ class DrawerButton(SawyerTask):
     """Where the drawer stands."""
     boxes = Box((0.16, 0.86, 0.115), (0.26, 0.92, 0.115))
     """Where the box with the button stands."""
-    test_starts = Box((-0.1, 0.42, 0.1), (0.1, 0.52, 0.28))
+    test_starts = Box((-0.1, 0.42, 0.08), (0.1, 0.52, 0.24))
     drawer_share = 0.5
     """Share of data trajectories that are of the drawer."""
     near_share = 0.3
