@@ -2,7 +2,7 @@
 
 ours: the paper gives no dimensions. Drawn in pixels of the 64×64 frame like SpiralMaze. The obstacles are bars that overlap
 in the middle of the room, one above the other. On one side a bar leaves no gap that the block could pass, on the other side
-it leaves the way open, the two bars on opposite sides: every way from the lower wall to the upper one bends at both. They
+it leaves the way open, the two bars on opposite sides: every way from the lower wall to the upper one is an S. The bars
 stand at whole pixels, so that two contexts differ in the frame whenever they differ at all.
 """
 
