@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
-import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,7 +26,7 @@ from velap.runs import MetricsLog, make_generator, write_atomic
 from velap.training.diagnostics import diagnose, measure_latents
 from velap.training.joint import JointLearner
 from velap.training.state import SCHEDULE, load_state, save_state
-from velap.training.steps import Cadence, Progress, interrupt_flag, run_steps
+from velap.training.steps import Cadence, Progress, cosine, interrupt_flag, run_steps
 
 STATE, MODEL = "state.safetensors", "model.safetensors"
 
@@ -113,7 +112,7 @@ class Trainer:
             if self.learner.cache is None:
                 self.learner.begin_latent_phase()
             done = (self.step - train.joint_steps) / max(train.latent_steps, 1)
-            self.learner.set_learning_rate(train.latent_learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done))))
+            self.learner.set_learning_rate(train.latent_learning_rate * cosine(done))
             info = self.learner.latent_step()
         self.step += 1
         return info

@@ -141,3 +141,8 @@ def interrupt_flag() -> Iterator[threading.Event]:
         yield flag
     finally:
         signal.signal(signal.SIGINT, previous)
+
+
+def cosine(done: float) -> float:
+    """Factor of the learning rate after a share `done` of the updates: 1 at the start, a hundredth at the end."""
+    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done))

@@ -1,0 +1,51 @@
+"""Behavioural cloning, App. D.1: BC on all transitions, BC(D*) on those of successful episodes only.
+
+B rows of a batch, A action dimension.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from velap.errors import DatasetError
+from velap.models.heads import PolicyHead
+from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
+from velap.training.losses import Info
+
+
+@dataclass(frozen=True)
+class BCConfig(LearnerConfig):
+    """D.1; every field as in LearnerConfig."""
+
+
+PAPER_BC = BCConfig(steps=300_000, batch=128, learning_rate=3e-4, cosine=False)
+"""D.1."""
+
+
+def cloning_error(action: Tensor, data_action: Tensor) -> Tensor:
+    """Squared error [B] of actions [B, A], averaged over A as in `losses.policy_loss`."""
+    return (action - data_action).square().mean(-1)
+
+
+class BCLearner(FrozenLearner[BCConfig, PolicyHead]):
+    """π(z) → a by mean-squared error."""
+
+    def loss(self, rows: Tensor) -> tuple[Tensor, Info]:
+        """Mean squared error of the predicted actions, D.1."""
+        data = self.data
+        loss = cloning_error(self.model.act(data.latents[rows]), data.actions[rows]).mean()
+        return loss, {"loss": loss.detach()}
+
+
+class SuccessBCLearner(BCLearner):
+    """BC(D*): the transitions of successful episodes only."""
+
+    def __init__(self, head: PolicyHead, data: LatentData, config: BCConfig, generator: torch.Generator) -> None:
+        super().__init__(head, data, config, generator)
+        if len(data.success_training) == 0:
+            raise DatasetError(f"{data.dataset_id} has no successful episode; BC(D*) learns from those alone and expects at "
+                               "least one with a reward of 1. Collect or label some successes, or use `--method bc`.")
+        self.pool, self.held_out = data.success_training, data.success_held_out
