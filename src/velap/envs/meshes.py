@@ -51,9 +51,9 @@ def face_normals(corners: Array) -> Array:
 
 
 def smoothed(corners: Array, vertices: NDArray[np.int64]) -> Mesh:
-    """A mesh of corners[F, 3, 3] whose normals are averaged over the triangles that share a vertex, but not across sharp edges.
+    """A mesh of corners[F, 3, 3] with the number of each corner's vertex, vertices[F, 3].
 
-    vertices[F, 3]: number of each corner's vertex.
+    Normals are averaged over the triangles that share a vertex, but not across sharp edges.
     """
     weighted = face_normals(corners)
     unit = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-30)
@@ -66,7 +66,7 @@ def smoothed(corners: Array, vertices: NDArray[np.int64]) -> Mesh:
     left = np.repeat(np.arange(len(vertex)), size)
     within = np.arange(len(left)) - np.repeat(np.cumsum(size) - size, size)
     right = np.repeat(np.repeat(start, count), size) + within
-    near = (unit[face[left]] * unit[face[right]]).sum(1) >= SHARP
+    near = np.einsum("ij,ij->i", unit[face[left]], unit[face[right]]) >= SHARP
     sums = np.zeros((len(vertex), 3))
     np.add.at(sums, left[near], weighted[face[right[near]]])
     normals = np.empty_like(sums)
@@ -80,16 +80,16 @@ def simplified(mesh: Mesh, cell: float) -> Mesh:
     Vertex clustering (Rossignac & Borrel 1993) with the representatives of Lindstrom 2000: the point of the cell that is
     nearest to the planes of all triangles that touch it. Triangles that collapse go, and so do copies of others.
     """
-    points = mesh.corners.reshape(-1, 3)
-    _, index = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_inverse=True)
-    index = index.ravel()
-    vertices = index.reshape(-1, 3)
+    cells = np.floor((mesh.corners - mesh.corners.min((0, 1))) / cell).astype(np.int64)
+    numbers = np.ravel_multi_index(tuple(np.moveaxis(cells, -1, 0)), tuple(cells.max((0, 1)) + 1))
+    vertices = np.unique(numbers, return_inverse=True)[1].reshape(-1, 3)
     representatives = _least_error_points(mesh.corners, vertices, cell)
     # the same triangle starts with its smallest vertex, whichever way it is turned
-    first = vertices.argmin(1)
-    turned = vertices[np.arange(len(vertices))[:, None], (first[:, None] + np.arange(3)) % 3]
-    whole = (turned[:, 0] != turned[:, 1]) & (turned[:, 1] != turned[:, 2]) & (turned[:, 0] != turned[:, 2])
-    faces = np.unique(turned[whole], axis=0)
+    turned = np.take_along_axis(vertices, (vertices.argmin(1)[:, None] + np.arange(3)) % 3, axis=1)
+    first, second, third = turned.T
+    turned = turned[(first != second) & (second != third) & (third != first)]
+    packed = np.unique(np.ravel_multi_index(tuple(turned.T), (len(representatives),) * 3))
+    faces = np.stack(np.unravel_index(packed, (len(representatives),) * 3), axis=1)
     return smoothed(representatives[faces], faces)
 
 
@@ -105,7 +105,7 @@ def _least_error_points(corners: Array, vertices: NDArray[np.int64], cell: float
     for corner in range(3):
         where = vertices[:, corner]
         # planes relative to the cluster's mean, which keeps the numbers small
-        offsets = (normals * (corners[:, corner] - means[where])).sum(1)
+        offsets = np.einsum("ij,ij->i", normals, corners[:, corner] - means[where])
         np.add.at(quadric, where, normals[:, :, None] * normals[:, None, :])
         np.add.at(linear, where, normals * offsets[:, None])
     # where the planes leave a direction open, the mean decides
