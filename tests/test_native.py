@@ -44,6 +44,21 @@ def test_a_network_equals_its_module(norm, inputs, hidden, outputs, rows):
     torch.testing.assert_close(found, network(x), rtol=2e-5, atol=2e-5)
 
 
+@pytest.mark.skipif(native.library() is None or not native.library().velap_halves(), reason="no bfloat16 arithmetic here")
+@torch.no_grad()
+@pytest.mark.parametrize("norm", ["layer", "batch", "none"])
+@pytest.mark.parametrize(("inputs", "hidden", "outputs"), SIZES)
+@pytest.mark.parametrize("rows", [1, 8, 61])
+def test_half_precision_stays_close_and_keeps_the_first_layer(norm, inputs, hidden, outputs, rows):
+    for network in (stirred(MLP(inputs, hidden, outputs, norm)), stirred(EnsembleMLP(2, inputs, hidden, norm))):
+        x = torch.randn(rows, inputs) + 100
+        x = x if norm == "layer" else x / 100
+        run = native.native_network(fold(dense_layers(network)), refuse, half=True)
+        exact = native.native_network(fold(dense_layers(network)), refuse)(x)
+        torch.testing.assert_close(run(x), exact, rtol=0.02, atol=0.02 * float(exact.abs().max()))
+        assert not torch.equal(run(x), exact)
+
+
 @needs_compiler
 @torch.no_grad()
 @pytest.mark.parametrize("norm", ["layer", "batch", "none"])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from velap.models.folded import dense_layers, fold
+from velap.models.folded import dense_layers, fold, folded_ensemble, folded_mlp
 from velap.models.native import native_network
 from velap.models.networks import LEAK, MLP, EnsembleMLP
 
@@ -68,19 +68,27 @@ def fast_ensemble(ensemble: EnsembleMLP) -> Forward:
     return forward
 
 
-def joined(network: MLP | EnsembleMLP) -> Callable[..., Tensor]:
+def joined(network: MLP | EnsembleMLP, hidden: torch.dtype | None = None) -> Callable[..., Tensor]:
     """The network on inputs side by side, `[*, W_1], [*, W_2], ...`, by `native.c` where it pays. Copies the weights.
 
     Gives `[*, outputs]` of an MLP and `[n, *]` of an ensemble, equal in eval mode, without gradients (and without tanh).
+    `hidden` folds normalisation for PyTorch as well, and runs the layers behind the first in that type.
     """
-    fast = fast_ensemble(network) if isinstance(network, EnsembleMLP) else fast_mlp(network)
+    fast = _by_torch(network, hidden)
 
     def by_torch(*parts: Tensor) -> Tensor:
         out = fast(torch.cat(parts, -1) if len(parts) > 1 else parts[0])
         return out.unsqueeze(-1) if isinstance(network, EnsembleMLP) else out
 
-    run = native_network(fold(dense_layers(network)), by_torch)
+    run = native_network(fold(dense_layers(network)), by_torch, half=hidden == torch.bfloat16)
     return (lambda *parts: run(*parts).squeeze(-1)) if isinstance(network, EnsembleMLP) else run
+
+
+def _by_torch(network: MLP | EnsembleMLP, hidden: torch.dtype | None) -> Forward:
+    """The network without native.c."""
+    if isinstance(network, EnsembleMLP):
+        return fast_ensemble(network) if hidden is None else folded_ensemble(network, hidden)
+    return fast_mlp(network) if hidden is None else folded_mlp(network, hidden)
 
 
 def nearest_row(bank: Tensor) -> Callable[[Tensor], Tensor]:

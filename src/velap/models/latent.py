@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from velap._version import __version__
 from velap.config import Config, ModelConfig, Precision
 from velap.errors import CheckpointError, VelapError
-from velap.models.folded import folded_ensemble, folded_mlp
 from velap.models.generative import ConditionalVAE
 from velap.models.inference import joined, nearest_row
 from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
@@ -158,13 +157,9 @@ class LatentModel(nn.Module):
         """h, g, π^g, Q^l and Q^g as the search calls them."""
         decoder, local_policy = joined(self.action_model.decoder), joined(self.local_policy)
         local_critics = joined(self.local_critics)
-        if hidden is None:
-            dynamics, global_policy = joined(self.dynamics), joined(self.global_policy)
-            global_critic = joined(self.global_critic)
-        else:
-            dtype: torch.dtype = getattr(torch, hidden)
-            dynamics, global_policy = folded_mlp(self.dynamics, dtype), folded_mlp(self.global_policy, dtype)
-            global_critic = folded_ensemble(self.global_critic, dtype)
+        dtype = None if hidden is None else getattr(torch, hidden)
+        dynamics, global_policy = joined(self.dynamics, dtype), joined(self.global_policy, dtype)
+        global_critic = joined(self.global_critic, dtype)
         residual, bound = self.config.dynamics_residual, self.bound
 
         def step(latent: Tensor, action: Tensor) -> Tensor:

@@ -3,8 +3,14 @@
    A layer is y = x W + b; where it has a shift, y / sqrt(mean(y^2) + eps) + shift; then LeakyReLU, except in the last
    layer. Weights lie in panels of PANEL columns, [outputs / PANEL, inputs, PANEL], padded with zeros, bias and shift
    padded likewise; velap/models/native.py packs them. Blocks of ROWS rows go through all layers while they are in the
-   first-level cache. The sums of a row are taken in one order whatever rows are beside it. */
+   first-level cache. The sums of a row are taken in one order whatever rows are beside it.
 
+   Layers with `halves` multiply in bfloat16 and sum in float32, on processors that can (velap_halves): their weights lie in
+   panels of pairs, [outputs / PANEL, inputs / 2, PANEL, 2], an odd last input padded with zeros. */
+
+#ifdef __AVX512F__
+#include <immintrin.h>
+#endif
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
@@ -24,7 +30,17 @@ typedef float vector __attribute__((vector_size(4 * LANES), aligned(4)));
 typedef struct {
     long inputs, outputs; /* outputs: not padded */
     const float *weights, *bias, *shift; /* shift: NULL where nothing is normalised */
+    const unsigned short *halves;        /* NULL where the layer is in float32 */
 } Layer;
+
+/* Whether layers may have `halves`. */
+int velap_halves(void) {
+#ifdef __AVX512BF16__
+    return 1;
+#else
+    return 0;
+#endif
+}
 
 static inline __attribute__((always_inline)) void products(const Layer *layer, const float *in, long in_stride, float *out,
                                                            long out_stride, const int rows) {
@@ -44,18 +60,63 @@ static inline __attribute__((always_inline)) void products(const Layer *layer, c
     }
 }
 
-static void activate(const Layer *layer, float *y, float eps, float leak) {
-    const long padded = (layer->outputs + PANEL - 1) / PANEL * PANEL; /* the padding is 0 and stays 0 */
-    if (layer->shift) {
-        vector squares = {0};
-        for (long j = 0; j < padded; j += LANES) squares += *(vector *)(y + j) * *(vector *)(y + j);
-        float sum = 0;
-        for (int l = 0; l < LANES; l++) sum += squares[l];
-        const float scale = 1 / sqrtf(sum / layer->outputs + eps);
-        for (long j = 0; j < padded; j += LANES)
-            *(vector *)(y + j) = *(vector *)(y + j) * scale + *(const vector *)(layer->shift + j);
+#ifdef __AVX512BF16__
+static inline __attribute__((always_inline)) void half_products(const Layer *layer, const unsigned short *in, long in_stride,
+                                                                float *out, long out_stride, const int rows) {
+    const long panels = (layer->outputs + PANEL - 1) / PANEL, pairs = (layer->inputs + 1) / 2;
+    for (long p = 0; p < panels; p++) {
+        const unsigned short *weights = layer->halves + p * pairs * 2 * PANEL;
+        __m512 sums[ROWS][VECTORS];
+        for (int r = 0; r < rows; r++)
+            for (int v = 0; v < VECTORS; v++) sums[r][v] = _mm512_loadu_ps(layer->bias + p * PANEL + v * LANES);
+        for (long i = 0; i < pairs; i++, weights += 2 * PANEL)
+            for (int v = 0; v < VECTORS; v++) {
+                const __m512bh column = (__m512bh)_mm512_loadu_si512(weights + 2 * v * LANES);
+                for (int r = 0; r < rows; r++) {
+                    int pair;
+                    memcpy(&pair, in + r * in_stride + 2 * i, sizeof pair);
+                    sums[r][v] = _mm512_dpbf16_ps(sums[r][v], (__m512bh)_mm512_set1_epi32(pair), column);
+                }
+            }
+        for (int r = 0; r < rows; r++)
+            for (int v = 0; v < VECTORS; v++) _mm512_storeu_ps(out + r * out_stride + p * PANEL + v * LANES, sums[r][v]);
     }
-    for (long j = 0; j < padded; j++) y[j] = y[j] < 0 ? leak * y[j] : y[j];
+}
+
+/* `count` floats as bfloat16, and the padding behind them: it is 0, so an odd last input has its pair. */
+static void halve(const float *x, long count, unsigned short *out) {
+    for (long j = 0; j < count; j += LANES)
+        _mm256_storeu_si256((__m256i *)(out + j), (__m256i)_mm512_cvtneps_pbh(_mm512_loadu_ps(x + j)));
+}
+#endif
+
+static inline float total(vector x) {
+#ifdef __AVX512F__
+    return _mm512_reduce_add_ps((__m512)x);
+#else
+    float sum = 0;
+    for (int l = 0; l < LANES; l++) sum += x[l];
+    return sum;
+#endif
+}
+
+static void activate(const Layer *layer, float *y, long stride, int rows, float eps, float leak) {
+    const long padded = (layer->outputs + PANEL - 1) / PANEL * PANEL; /* the padding is 0 and stays 0 */
+    float scales[ROWS]; /* all of them first: the roots of one row wait for nothing of another */
+    for (int r = 0; r < rows && layer->shift; r++) {
+        vector squares = {0};
+        for (long j = 0; j < padded; j += LANES) {
+            const vector part = *(vector *)(y + r * stride + j);
+            squares += part * part;
+        }
+        scales[r] = 1 / sqrtf(total(squares) / layer->outputs + eps);
+    }
+    for (int r = 0; r < rows; r++, y += stride) {
+        if (layer->shift)
+            for (long j = 0; j < padded; j += LANES)
+                *(vector *)(y + j) = *(vector *)(y + j) * scales[r] + *(const vector *)(layer->shift + j);
+        for (long j = 0; j < padded; j++) y[j] = y[j] < 0 ? leak * y[j] : y[j];
+    }
 }
 
 /* x: `parts` inputs side by side, part p [rows, widths[p]]; out [members, rows, outputs]; layers [members, count];
@@ -63,6 +124,9 @@ static void activate(const Layer *layer, float *y, float eps, float leak) {
 void velap_network(const Layer *layers, long members, long count, const float *const *x, const long *widths, long parts,
                    long rows, long width, float eps, float leak, float *out) {
     float scratch[2 * ROWS * width];
+#ifdef __AVX512BF16__
+    unsigned short halves[ROWS * width];
+#endif
     for (long start = 0; start < rows; start += ROWS) {
         const int block = (int)(rows - start < ROWS ? rows - start : ROWS);
         for (long m = 0; m < members; m++) {
@@ -74,15 +138,21 @@ void velap_network(const Layer *layers, long members, long count, const float *c
             }
             for (long l = 0; l < count; l++) {
                 const Layer *layer = layers + m * count + l;
+#ifdef __AVX512BF16__
+                for (int r = 0; r < block && layer->halves; r++) halve(in + r * width, layer->inputs, halves + r * width);
+#define PRODUCTS(n) \
+    layer->halves ? half_products(layer, halves, width, next, width, n) : products(layer, in, width, next, width, n)
+#else
+#define PRODUCTS(n) products(layer, in, width, next, width, n)
+#endif
                 switch (block) { /* a constant number of rows keeps the sums in registers */
-#define CASE(n) case n: products(layer, in, width, next, width, n); break;
+#define CASE(n) case n: PRODUCTS(n); break;
                     CASE(1) CASE(2) CASE(3) CASE(4)
 #if ROWS == 8
                     CASE(5) CASE(6) CASE(7) CASE(8)
 #endif
                 }
-                if (l + 1 < count)
-                    for (int r = 0; r < block; r++) activate(layer, next + r * width, eps, leak);
+                if (l + 1 < count) activate(layer, next, width, block, eps, leak);
                 float *swap = in;
                 in = next;
                 next = swap;

@@ -39,7 +39,7 @@ class _Layer(ctypes.Structure):
     """`Layer` of native.c."""
 
     _fields_ = (("inputs", ctypes.c_long), ("outputs", ctypes.c_long), ("weights", ctypes.c_void_p),
-                ("bias", ctypes.c_void_p), ("shift", ctypes.c_void_p))
+                ("bias", ctypes.c_void_p), ("shift", ctypes.c_void_p), ("halves", ctypes.c_void_p))
 
 
 @cache
@@ -82,23 +82,27 @@ def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
     found.velap_network.argtypes = [address, number, number, address, address, number, number, number, ctypes.c_float,
                                     ctypes.c_float, address]
     found.velap_network.restype = None
+    found.velap_halves.argtypes, found.velap_halves.restype = [], ctypes.c_int
     return found
 
 
-def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor]) -> Callable[..., Tensor]:
+def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor], half: bool = False) -> Callable[..., Tensor]:
     """Inputs `[*, W_1], [*, W_2], ...`, taken side by side, → `[n, *, V]` of the members, or `[*, V]` of weights [W, V].
+
+    `half` multiplies in bfloat16 in all layers but the first, which keeps the precision of the latents.
 
     `otherwise` gets what native.c cannot take (other devices and types, more rows than pay) and must give the same. The
     weights are copied.
     """
     found = library()
     wide = max(max(layer.weight.shape[-2:]) for layer in layers) > MOST_UNITS
-    if found is None or wide or any(tensor.dtype != torch.float32 or tensor.device.type != "cpu"
-                            for layer in layers for tensor in (layer.weight, layer.bias)):
+    if found is None or wide or (half and not found.velap_halves()):
+        return otherwise
+    if any(tensor.dtype != torch.float32 or tensor.device.type != "cpu" for layer in layers for tensor in layer[:2]):
         return otherwise
     single = layers[0].weight.dim() == 2
     members = 1 if single else len(layers[0].weight)
-    kept, structs = _pack(layers, members)
+    kept, structs = _pack(layers, members, half)
     width = max(-(-size // PANEL) * PANEL for layer in layers for size in layer.weight.shape[-2:])
     outputs, inputs = layers[-1].weight.shape[-1], layers[0].weight.shape[-2]
     run, fixed = found.velap_network, (ctypes.addressof(structs), members, len(layers))
@@ -122,7 +126,7 @@ def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor]) -
 
 
 @torch.no_grad()
-def _pack(layers: Sequence[Folded], members: int) -> tuple[list[Tensor], ctypes.Array[_Layer]]:
+def _pack(layers: Sequence[Folded], members: int, half: bool) -> tuple[list[Tensor], ctypes.Array[_Layer]]:
     """Weights in panels, and the structs that point to them, member by member."""
     kept: list[Tensor] = []
     structs = (_Layer * (members * len(layers)))()
@@ -138,8 +142,13 @@ def _pack(layers: Sequence[Folded], members: int) -> tuple[list[Tensor], ctypes.
             if part is not None:
                 vectors[-1][:, :outputs] = part.reshape(members, outputs)
         kept += [panels, *vectors]
+        if half and index > 0:
+            pairs = torch.cat([panels, panels.new_zeros(members, padded // PANEL, inputs % 2, PANEL)], 2)
+            pairs = pairs.unflatten(2, (-1, 2)).transpose(3, 4).to(torch.bfloat16).contiguous()
+            kept.append(pairs)
         for member in range(members):
             shift = vectors[1][member].data_ptr() if layer.shift is not None else None
             structs[member * len(layers) + index] = _Layer(inputs, outputs, panels[member].data_ptr(),
-                                                           vectors[0][member].data_ptr(), shift)
+                                                           vectors[0][member].data_ptr(), shift,
+                                                           pairs[member].data_ptr() if half and index > 0 else None)
     return kept, structs
