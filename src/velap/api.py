@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from velap.config import Config, override
+from velap.errors import ConfigError
 from velap.storage import run_dir
 from velap.tasks import TASKS, get_task, make_config
 
@@ -65,35 +66,60 @@ def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwr
 
 
 def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Path | None = None, *,
-          image_key: str | None = None, device: str = "auto", resume: bool = False, changes: Changes | None = None,
-          command: str = "velap.train", on_progress: Callable[[Progress], None] = lambda progress: None) -> Path:
-    """Train on a task's dataset, or on any Minari dataset with images and a sparse reward; returns the checkpoint.
+          method: str = "velap", image_key: str | None = None, device: str = "auto", resume: bool = False,
+          changes: Changes | None = None, command: str = "velap.train",
+          on_progress: Callable[[Progress], None] = lambda progress: None) -> Path:
+    """Train on a task's dataset, or on any Minari dataset with images and a sparse reward; returns the joint checkpoint.
+
+    All methods share the joint training, which is done first where its checkpoint is missing. What BC, IQL and IRIS learn on
+    its latents lies beside it as `<method>.safetensors`, where `load` and `evaluate` find it.
 
     Args:
         task_or_dataset: task name, or Minari dataset id.
         preset: `default` or `paper`.
         seed: decides weights and batches.
         out: run directory; None takes `runs/<task>/<preset>/seed<seed>`.
+        method: one of `velap.agents.base.METHODS`.
         image_key: key of the image in dict observations.
         device: `auto`, `cpu` or `cuda`.
-        resume: go on with the run in `out`; a finished one is left as it is.
-        changes: config fields to replace.
+        resume: go on with the joint run in `out`; a finished one is left as it is. Heads always go on.
+        changes: config fields to replace; under `head` those of the method's learner.
         command: kept in the checkpoint as its origin.
         on_progress: called after every logged step.
     """
     from velap.data.episodes import load_store
+    from velap.models.heads import HEADS
+    from velap.training.heads import check_trainable, learner_config, train_head
     from velap.training.loop import MODEL
     from velap.training.loop import train as run
 
-    task = task_of(task_or_dataset)
+    check_trainable(method)
+    task, changes = task_of(task_or_dataset), dict(changes or {})
+    of_head = changes.pop("head", {})
+    learner = learner_config(method, preset, of_head) if method in HEADS or of_head else None
     config = config_for(task, preset, changes)
     dataset_id = TASKS[task_or_dataset].dataset_id if task_or_dataset in TASKS else task_or_dataset
     store = load_store(dataset_id, image_key, min_length=config.train.dynamics_horizon)
     directory = out or run_dir(task, preset, seed)
-    if resume and _is_finished(directory / MODEL, config, seed, store.content_hash):
-        return directory / MODEL
-    result = run(config, store, directory, seed=seed, device=device, resume=resume, command=command, on_progress=on_progress)
-    return result.checkpoint
+    checkpoint = directory / MODEL
+    if learner is not None and checkpoint.exists():
+        _check_origin(checkpoint, task, preset, seed)
+    elif not (resume and _is_finished(checkpoint, config, seed, store.content_hash)):
+        run(config, store, directory, seed=seed, device=device, resume=resume, command=command, on_progress=on_progress)
+    if learner is not None:
+        train_head(method, checkpoint, store, config=learner, device=device, command=command, on_progress=on_progress)
+    return checkpoint
+
+
+def _check_origin(checkpoint: Path, task: str, preset: str, seed: int) -> None:
+    """Raises ConfigError unless a joint checkpoint comes from this task, preset and seed."""
+    from velap.models.latent import load_checkpoint
+
+    _, config, metadata = load_checkpoint(checkpoint)
+    found, asked = (config.task, config.preset, int(metadata["seed"])), (task, preset, seed)
+    if found != asked:
+        raise ConfigError(f"{checkpoint} has task, preset and seed {found}; expected {asked}. Name its own with "
+                          "--preset and --seed, or another run directory with --out.")
 
 
 def _is_finished(checkpoint: Path, config: Config, seed: int, dataset_hash: str) -> bool:

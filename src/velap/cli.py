@@ -58,8 +58,11 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
 
 def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: str | None = None,
           preset: Preset = "default", seed: int = 0, out: Path | None = None, device: Device = "auto", resume: bool = False,
-          settings: Settings = ()) -> None:
+          settings: Settings = (), method: Method = "velap") -> None:
     """Train on a task's dataset or on any Minari dataset with images and a sparse reward.
+
+    All methods share the joint training; it is done first where its checkpoint is missing. BC, IQL and IRIS then learn on
+    its latents (`--set head.steps=5000` changes how) and go on by themselves after an interruption.
 
     Args:
         task: Task name; leave it out with --dataset.
@@ -76,22 +79,44 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
         from velap.tasks import get_task
 
         get_task(task)
-    checkpoint = _train(str(task or dataset), preset, seed, out, image_key, device, resume, settings)
+    checkpoint = _train(str(task or dataset), preset, seed, out, image_key, device, resume, settings, method)
     OUT.print(f"checkpoint {checkpoint}", markup=False)
 
 
 def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str | None, device: str, resume: bool,
-           settings: Sequence[str]) -> Path:
-    """Train with a progress bar; returns the checkpoint."""
+           settings: Sequence[str], method: str = "velap") -> Path:
+    """Train with a progress bar; returns the joint checkpoint."""
     from velap import api
     from velap.bench.console import TrainView
+    from velap.models.heads import HEADS
+    from velap.training.heads import learner_config
+    from velap.training.loop import MODEL
 
+    learns = method in HEADS
+    changes = parse_settings(settings, {"head": learner_config(method, preset)} if learns else {})
+    directory = out or api.run_dir(api.task_of(source), preset, seed)
+    if learns and not (directory / MODEL).exists():
+        ERR.print(f"note: no joint checkpoint in {directory}; it is trained first", markup=False, soft_wrap=True)
     view = TrainView(OUT)
     try:
-        return api.train(source, preset, seed, out, image_key=image_key, device=device, resume=resume,
-                         changes=parse_settings(settings), command=_command(), on_progress=view)
+        checkpoint = api.train(source, preset, seed, out, method=method, image_key=image_key, device=device, resume=resume,
+                               changes=changes, command=_command(), on_progress=view)
     finally:
         view.close()
+    if learns:
+        _show_head(checkpoint, method)
+    return checkpoint
+
+
+def _show_head(checkpoint: Path, method: str) -> None:
+    """Where the head is, how long it took, and its held-out losses."""
+    from velap.models.heads import head_path
+    from velap.training.heads import read_result
+
+    result = read_result(head_path(checkpoint, method))
+    losses = ", ".join(f"{name} {value:.3g}" for name, value in result.diagnostics.items())
+    OUT.print(f"head {result.path}: {result.steps} updates in {result.seconds:.0f} s; {losses}", markup=False,
+              soft_wrap=True)
 
 
 def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap", episodes: int = 100, first_seed: int = 0,
@@ -162,12 +187,47 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
     _evaluate(Evaluation(task, checkpoint=checkpoint, device=device), range(episodes), records, False, 10, False)
 
 
-def table(records: Records = Path("results/records"), write: Path | None = None) -> None:
-    """Print the results table of all records, or write it into a document between its table marks.
+def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make Table 1 of the paper.")] = None,
+          records: Records = Path("results/records"), write: Path | None = None, only: tuple[str, ...] = (), jobs: int = 2,
+          dry_run: bool = False, no_run: bool = False, fresh: bool = False, episodes: int = 100, batch: int = 1) -> None:
+    """Print the statistics of all records; with `1`, run whatever Table 1 still lacks and write it.
+
+    `velap table 1` collects, trains and evaluates every cell that has no records of today's config, and can be interrupted
+    at any time: the same command goes on from there.
 
     Args:
-        write: Document to update, such as README.md.
+        write: Document to update: README.md with its table marks; with `1` docs/results.md, or another one to write.
+        only: Cells to run, such as `task=SpiralMaze method=bc,iql`. Axes are task, method, preset and seed; unless said all
+            tasks, all methods, preset=default and seed=0.
+        jobs: Jobs at once, on one machine; each gets its share of the cores.
+        dry_run: Only say what is there, what is missing and how long it should take.
+        no_run: Only write the table from the records that are there.
+        fresh: Move runs and records of another config aside and make them anew; their jobs fail otherwise.
+        episodes: Test episodes of a cell, seeds from 0.
+        batch: Episodes at once; one by one, an interruption loses one episode at most.
     """
+    if number is None:
+        if only or dry_run or no_run or fresh or (jobs, episodes, batch) != (2, 100, 1):
+            raise ConfigError("got options of `velap table 1` without the number; expected `velap table 1 ...`, or only "
+                              "--records and --write.")
+        _table_of_records(records, write)
+        return
+    from velap.bench.jobs import Options
+    from velap.bench.matrix import parse_only
+    from velap.bench.table_command import Places, TableOne
+
+    places = Places() if write is None else Places(page=write)
+    one = TableOne(parse_only(only), Options(records, episodes, batch), places, jobs, fresh)
+    if dry_run:
+        one.dry_run(OUT)
+    elif no_run:
+        one.write(OUT)
+    else:
+        one.run(OUT)
+
+
+def _table_of_records(records: Path, write: Path | None) -> None:
+    """Every record file on a line, printed or written between the table marks of a document."""
     from velap.bench.report import markdown_table, rich_table, summarise_all, write_into
 
     summaries = summarise_all(records)
@@ -226,6 +286,18 @@ def study(subject: Annotated[Positional[Literal["faults", "experts"]],
         study_experts(OUT, quick, seed, write, json)
 
 
+def figure(name: Annotated[Positional[Literal["sawyer-drawing"]], arg(help="What to draw.")],
+           write: Path | None = None) -> None:
+    """Draw a picture of the documentation anew: `sawyer-drawing`, our drawing of the arm beside Meta-World's geometry.
+
+    Args:
+        write: Where it goes; docs/NAME.png (with _ for -) unless said.
+    """
+    from velap.bench.drawing import show_drawing
+
+    show_drawing(OUT, write or Path("docs") / f"{name.replace('-', '_')}.png")
+
+
 def info() -> None:
     """Versions, tasks and what this machine offers."""
     from velap.bench.info import describe
@@ -235,7 +307,7 @@ def info() -> None:
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": demo, "collect": collect, "train": train, "evaluate": evaluate, "run": run, "table": table, "bench": bench,
-    "study": study, "info": info,
+    "study": study, "figure": figure, "info": info,
 }
 
 

@@ -25,6 +25,7 @@ class View:
         self._title = title
         self._total = total
         self._last_line = time.monotonic()
+        self._first: tuple[int, float] | None = None
         self._bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                              TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[info]}"), console=console,
                              disable=not console.is_terminal)
@@ -35,9 +36,20 @@ class View:
         self._title = title or self._title
         self._bar.update(self._task, completed=done, info=info, description=self._title)
         now = time.monotonic()
+        if self._first is None:
+            self._first = (done, now)
         if not self._console.is_terminal and (done == self._total or now - self._last_line >= LINE_EVERY):
             self._last_line = now
-            self._console.print(f"{self._title}: {done} of {self._total}  {info}", markup=False, soft_wrap=True)
+            self._console.print(f"{self._title}: {done} of {self._total}{self._left(done, now)}  {info}", markup=False,
+                                soft_wrap=True)
+
+    def _left(self, done: int, now: float) -> str:
+        """How much longer it takes at the pace so far."""
+        first, start = self._first or (done, now)
+        if done <= first or done >= self._total:
+            return ""
+        seconds = (now - start) / (done - first) * (self._total - done)
+        return f", {seconds / 60:.0f} min left" if seconds > 120 else f", {seconds:.0f} s left"
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -48,23 +60,30 @@ class View:
 
 
 class TrainView:
-    """Shows the steps and losses of a training run; the total is known with the first report."""
+    """Shows the steps and losses of training runs, one after the other; a total is known with the first report."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._view: View | None = None
+        self._shown: TrainProgress | None = None
 
     def __call__(self, progress: TrainProgress) -> None:
         """One report of the training loop."""
+        if self._shown is not None and (progress.total != self._shown.total or progress.step < self._shown.step):
+            self.close()
         if self._view is None:
             self._view = View(self._console, "training", progress.total).__enter__()
+        self._shown = progress
         losses = "  ".join(f"{name.removeprefix('loss/')} {value:.3g}" for name, value in list(progress.info.items())[:6])
-        self._view.show(progress.step, losses, f"training, {progress.phase} phase")
+        joint = progress.phase in ("joint", "latent")
+        title = f"training, {progress.phase} phase" if joint else f"learning {progress.phase}"
+        self._view.show(progress.step, losses, title)
 
     def close(self) -> None:
         """Stop drawing."""
         if self._view is not None:
             self._view.__exit__(None, None, None)
+            self._view = None
 
 
 class EpisodeView(View):

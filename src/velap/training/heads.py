@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from velap.data.episodes import FrameStore
-from velap.errors import CheckpointError, DatasetError, TrainingError, UnknownTaskError
-from velap.models.heads import HEADS, AnyHead, head_path, make_head, save_head
+from velap.errors import CheckpointError, ConfigError, DatasetError, TrainingError, UnknownTaskError
+from velap.models.heads import AnyHead, head_path, make_head, save_head
 from velap.models.latent import WEIGHTS_SHA256, load_checkpoint
 from velap.runs import MetricsLog, load_tensors, make_generator
 from velap.threads import one_thread
@@ -60,6 +60,8 @@ class HeadResult:
     """Outcome of one training of a head."""
 
     path: Path
+    steps: int
+    """Updates."""
     seconds: float
     """Training time, all sittings [s]."""
     diagnostics: dict[str, float]
@@ -127,19 +129,35 @@ class HeadRun:
         return self.step
 
 
+JOINT_METHODS = ("velap", "td3bc", "mppi", "mbop")
+"""Methods that act by the joint checkpoint and learn nothing more."""
+
+
+def check_trainable(method: str) -> None:
+    """Raises UnknownTaskError unless there is something to train for that method."""
+    known = (*JOINT_METHODS, *RECIPES)
+    if method not in known:
+        raise UnknownTaskError(f"cannot train the method {method!r}; expected one of {', '.join(known)}. `random` has "
+                               "nothing to learn.")
+
+
 def recipe_of(method: str) -> Recipe:
     """The recipe of that method; raises UnknownTaskError for a method without a learner of its own."""
     if method not in RECIPES:
-        raise UnknownTaskError(f"the method {method!r} has no learner of its own; expected one of {', '.join(HEADS)}. The "
+        raise UnknownTaskError(f"the method {method!r} has no learner of its own; expected one of {', '.join(RECIPES)}. The "
                                "others act by the joint checkpoint alone: `velap train TASK`.")
     return RECIPES[method]
 
 
-def learner_config(method: str, preset: str, steps: int | None = None) -> LearnerConfig:
-    """Config of a method's learner in a preset; `steps` replaces its length."""
+def learner_config(method: str, preset: str, changes: Mapping[str, Any] | None = None) -> LearnerConfig:
+    """Config of a method's learner in a preset, with the fields of `changes` replaced."""
     recipe = recipe_of(method)
     config = recipe.paper if preset == "paper" else recipe.default
-    return config if steps is None else dataclasses.replace(config, steps=steps)
+    names = [field.name for field in dataclasses.fields(config)]
+    unknown = sorted(set(changes or {}) - set(names))
+    if unknown:
+        raise ConfigError(f"the learner of {method!r} has no field {unknown}; expected some of {names}.")
+    return dataclasses.replace(config, **(changes or {}))
 
 
 def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path | None = None, *, seed: int | None = None,
@@ -164,7 +182,7 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
     recipe_of(method)
     checkpoint, place = Path(checkpoint), pick_device(device)
     model, joint, metadata = load_checkpoint(checkpoint, place)
-    config = config or learner_config(method, joint.preset, steps)
+    config = config or learner_config(method, joint.preset, {} if steps is None else {"steps": steps})
     trained_on = metadata.get("dataset_hash", store.content_hash)
     if trained_on != store.content_hash:
         raise DatasetError(f"{checkpoint} was trained on a dataset with hash {trained_on[:12]}, {store.dataset_id} has "
@@ -188,6 +206,15 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
     return _finish(run, head, metadata, {"command": command, "dataset_id": store.dataset_id})
 
 
+def read_result(path: Path) -> HeadResult:
+    """The outcome that a head's file tells of."""
+    return _result(path, load_tensors(path)[1])
+
+
+def _result(path: Path, metadata: Mapping[str, str]) -> HeadResult:
+    return HeadResult(path, int(metadata["steps"]), float(metadata["train_seconds"]), json.loads(metadata["diagnostics"]))
+
+
 def _finished(path: Path, identity: dict[str, str]) -> HeadResult | None:
     """The result in `path` if it is what this run would give; a note where another one is about to be replaced."""
     if not path.exists():
@@ -201,7 +228,7 @@ def _finished(path: Path, identity: dict[str, str]) -> HeadResult | None:
     if other:
         warnings.warn(f"{path} was learnt with another {', '.join(other)} and is replaced", UserWarning, stacklevel=3)
         return None
-    return HeadResult(path, float(metadata["train_seconds"]), json.loads(metadata["diagnostics"]))
+    return _result(path, metadata)
 
 
 def _run(run: HeadRun, on_progress: Callable[[Progress], None]) -> None:
@@ -225,4 +252,4 @@ def _finish(run: HeadRun, head: AnyHead, joint_metadata: dict[str, str], origin:
                   "diagnostics": json.dumps(diagnostics)}
     save_head(run.path, head, joint_metadata, provenance)
     run.state_path.unlink(missing_ok=True)
-    return HeadResult(run.path, run.seconds, diagnostics)
+    return read_result(run.path)

@@ -106,8 +106,8 @@ def run_steps(run: Run, log: MetricsLog, on_progress: Callable[[Progress], None]
             bad = sorted(name for name, value in row.items() if not math.isfinite(value))
             if bad:
                 kept = f"the last good state is in {run.state_path}" if run.state_path.exists() else "no state is kept yet"
-                raise TrainingError(f"{', '.join(bad)} became NaN or infinite at step {run.step}; expected finite losses. Check "
-                                    f"the data for bad actions, or lower the learning rate; {kept}.")
+                raise TrainingError(f"{', '.join(bad)} became NaN or infinite at step {run.step}; expected finite losses. "
+                                    f"Check the data for bad actions, or lower the learning rate; {kept}.")
         if run.step % every.diagnose == 0 or last:
             row |= run.report()
         now = time.monotonic()
