@@ -137,8 +137,8 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
         """Start an episode.
 
         `options` may hold `split`: "train" starts as in data collection, "test" (the default) as in evaluation; and
-        `context`: the number of an initialisation of all but the agent (Table 10), by default drawn anew. Tasks with one
-        context ignore it.
+        `context`: the number of an initialisation of all but the agent (Table 10), by default drawn anew. Each split numbers
+        its own, no test context is one of the training data. Tasks with one context ignore it.
         """
         self.start(options, seed)
         return self.render(), {"success": False}

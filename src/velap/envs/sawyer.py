@@ -139,7 +139,9 @@ class SawyerTask(PixelTask):
 
     def _start(self, rng: np.random.Generator, split: str, context: int | None) -> None:
         mujoco.mj_setState(self.model, self.data, self._home, _STATE)
-        self._place(rng if context is None else np.random.default_rng([_CONTEXT_STREAM, context]))
+        # each split numbers its own contexts: those of the training data are never test contexts
+        stream = _CONTEXT_STREAMS[split]
+        self._place(rng if context is None else np.random.default_rng([stream, context]))
         self._set_objects()
         mujoco.mj_forward(self.model, self.data)  # where the objects are, for starts that are near them
         for _ in range(_MAX_TRIES):
@@ -189,8 +191,8 @@ class SawyerTask(PixelTask):
         return self.data.mocap_pos[0].copy()
 
 
-_CONTEXT_STREAM = 20231106
-"""Keeps the random numbers of numbered contexts apart from those of seeds."""
+_CONTEXT_STREAMS = {"train": 20231106, "test": 20231107}
+"""Keep the random numbers of numbered contexts apart from those of seeds."""
 
 
 @cache
