@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from velap.agents.base import METHODS
-from velap.bench.paper import METHODS as PAPER_METHODS
+from velap.bench.paper import LABELS
 from velap.bench.paper import TASKS as PAPER_TASKS
 from velap.errors import ConfigError, UnknownTaskError
 from velap.tasks import PRESETS, TASKS
@@ -56,7 +56,7 @@ class Selection:
 
 def everything() -> Selection:
     """All tasks and methods, the default preset, training seed 0."""
-    return Selection(in_paper_order(TASKS, PAPER_TASKS), in_paper_order(METHODS, PAPER_METHODS))
+    return Selection(in_paper_order(TASKS, PAPER_TASKS), in_paper_order(METHODS, tuple(LABELS)))
 
 
 def parse_only(filters: Sequence[str]) -> Selection:
@@ -76,10 +76,10 @@ def parse_only(filters: Sequence[str]) -> Selection:
             raise ConfigError(f"--only names the axis {axis!r} twice; give all its values at once: {axis}=A,B.")
         chosen[axis] = tuple(dict.fromkeys(names))
     known = {"task": whole.tasks, "method": whole.methods, "preset": PRESETS}
-    for axis, values in known.items():
-        _check_names(axis, chosen.get(axis, ()), values)
+    for name, allowed in known.items():
+        _check_names(name, chosen.get(name, ()), allowed)
     return Selection(in_paper_order(chosen.get("task", whole.tasks), PAPER_TASKS),
-                     in_paper_order(chosen.get("method", whole.methods), PAPER_METHODS),
+                     in_paper_order(chosen.get("method", whole.methods), tuple(LABELS)),
                      chosen.get("preset", whole.presets), tuple(_seed(text) for text in chosen.get("seed", ("0",))))
 
 

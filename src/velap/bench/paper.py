@@ -34,11 +34,12 @@ _ROWS: dict[str, tuple[tuple[int, int], ...]] = {
     "DrawerButton": ((0, 0), (0, 0), (0, 0), (1, 0), (0, 0), (0, 0), (5, 3), (0, 0), (11, 3)),
 }
 
-TABLE_1 = {(task, method): Published(*cell) for task, row in _ROWS.items() for method, cell in zip(METHODS, row, strict=True)}
+TABLE_1 = {(task, method): Published(*cell)
+           for task, row in _ROWS.items() for method, cell in zip(METHODS, row, strict=True)}
 """(task, method) -> what the paper reports."""
 
 LABELS = {
     "bc": "BC", "bc-success": "BC (D*)", "td3bc": "TD3-BC", "iql": "IQL", "iql-sparse": "IQL (0.9 / 10)", "mppi": "MPPI",
     "mbop": "MBOP", "iris": "IRIS", "iris-multistep": "IRIS (multi-step)", "velap": "VELAP", "random": "random",
 }
-"""How tables name the methods."""
+"""How tables name the methods, in the order of their rows: those of Table 1 and, beside them, ours."""

@@ -108,8 +108,13 @@ def summary_table(summary: Summary) -> Table:
 
 def markdown_table(summaries: Iterable[Summary]) -> str:
     """The table for a document."""
-    rows = [COLUMNS, ("---",) * len(COLUMNS), *(cells(summary) for summary in summaries)]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    return markdown_rows(COLUMNS, (cells(summary) for summary in summaries))
+
+
+def markdown_rows(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [columns, ("---",) * len(columns), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def summarise_all(root: Path) -> list[Summary]:

@@ -1,0 +1,193 @@
+"""`velap table 1`: make the plan, say what is missing, run it, write the table."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rich.console import Console
+
+from velap.bench.children import CODE
+from velap.bench.evaluate import code_version
+from velap.bench.forecast import Forecast
+from velap.bench.inventory import Finding, Inventory, checkpoint_path
+from velap.bench.jobs import Job, Options, make_plan
+from velap.bench.jobs_view import JobsView, plan_table, totals
+from velap.bench.matrix import Selection, everything
+from velap.bench.results_page import results_page
+from velap.bench.runner import Outcome, Runner
+from velap.bench.schedule import Schedule
+from velap.bench.speed import hardware
+from velap.bench.table1 import Results, gather
+from velap.bench.table1_text import markdown_cells, to_csv, to_latex
+from velap.bench.timings import Timing, Timings
+from velap.errors import ConfigError, RecordError, VelapError
+from velap.runs import write_atomic
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a table keeps what it writes, besides records and runs."""
+
+    results: Path = Path("results")
+    """`timings.json`, `table1.csv` and `table1-PRESET.tex`."""
+    page: Path = Path("docs/results.md")
+    logs: Path = Path("runs/table")
+    """What the jobs print, and the lock."""
+
+
+@dataclass(frozen=True)
+class TableOne:
+    """One call of the command."""
+
+    selection: Selection
+    options: Options = field(default_factory=Options)
+    places: Places = field(default_factory=Places)
+    jobs: int = 2
+    """Jobs at once. ours: two processes of one thread do more on two cores than one of two threads."""
+    fresh: bool = False
+    """Move runs and records of another config aside and make them anew; their jobs fail otherwise."""
+    code: str = CODE
+    """Python code of a child process."""
+
+    def __post_init__(self) -> None:
+        if self.jobs < 1 or self.options.episodes < 1 or self.options.batch < 1:
+            raise ConfigError(f"got {self.jobs} jobs, {self.options.episodes} episodes in batches of {self.options.batch}; "
+                              "expected at least one of each.")
+
+    @property
+    def cores(self) -> int:
+        """Cores that this process may use."""
+        return len(os.sched_getaffinity(0))
+
+    def dry_run(self, console: Console) -> None:
+        """Say what is there, what is missing and how long it should take."""
+        jobs, forecast = self._plan(self.selection)
+        console.print(plan_table(jobs, forecast))
+        for line in self._totals(self.selection):
+            console.print(line, markup=False, soft_wrap=True)
+
+    def run(self, console: Console) -> None:
+        """Run what is missing, then write the table; raises VelapError at the end when a job failed."""
+        with _only_one(self.places.logs / "lock"):
+            jobs, forecast = self._plan(self.selection)
+            with JobsView(console, jobs, forecast) as view:
+                outcome = self._runner(view).run(Schedule(jobs, {job.name: forecast.left(job) for job in jobs}))
+            self.write(console)
+        _raise_failures(outcome, len(jobs))
+
+    def write(self, console: Console) -> None:
+        """Write the table in every form from the records that are there, and print it."""
+        self._note_training_times()
+        results = gather(self._inventory(), self._timings(), self.selection.presets)
+        files = {self.places.results / "table1.csv": to_csv(results)}
+        for preset in results.presets:
+            files[self.places.results / f"table1-{preset}.tex"] = to_latex(results, preset)
+        files[self.places.page] = self._page(results)
+        for path, text in files.items():
+            write_atomic(path, text.encode())
+        for preset in results.presets:
+            console.print(f"preset {preset}\n{markdown_cells(results.of(preset))}", markup=False, soft_wrap=True)
+        for note in results.notes:
+            console.print(f"note: {note}", markup=False, soft_wrap=True)
+        console.print(f"written to {', '.join(map(str, files))}", markup=False, soft_wrap=True)
+
+    def _page(self, results: Results) -> str:
+        budget = self._totals(dataclasses.replace(everything(), presets=("default",)))
+        return results_page(results, self._inventory(), self._timings(), self.options, budget)
+
+    def _totals(self, selection: Selection) -> list[str]:
+        jobs, forecast = self._plan(selection)
+        return totals(jobs, forecast, str(selection), self.jobs, self.cores)
+
+    def _plan(self, selection: Selection) -> tuple[tuple[Job, ...], Forecast]:
+        jobs = make_plan(selection.cells(), self._inventory(), self.options)
+        return jobs, Forecast(jobs, self._timings(), hardware())
+
+    def _timings(self) -> Timings:
+        return Timings(self.places.results / "timings.json")
+
+    def _inventory(self) -> Inventory:
+        return Inventory(self.options.records, self.options.episodes, self._timings())
+
+    def _runner(self, view: JobsView) -> Runner:
+        threads = max(self.cores // self.jobs, 1)
+        return Runner(lambda job: self._prepare(job, threads), self._look,
+                      lambda job, seconds, units: self._record(job, seconds, units, threads), view, self.jobs, threads,
+                      self.places.logs, self.code)
+
+    def _look(self, job: Job) -> Finding:
+        return self._inventory().look(job.kind, job.cell)
+
+    def _prepare(self, job: Job, threads: int) -> tuple[str, ...] | None:
+        """The command to run now: what an earlier job made may have changed what is there of this one."""
+        finding = self._look(job)
+        if finding.finished:
+            return None
+        extra = ("--workers", str(threads)) if job.kind == "dataset" else ()
+        if not finding.problem:
+            return (*job.command, *extra)
+        if not self.fresh:
+            raise RecordError(f"{finding.problem}. Add --fresh to move it aside and make it anew.")
+        if job.kind == "joint":
+            _move_aside(checkpoint_path(job.cell.task, job.cell.preset, job.cell.seed).parent)
+            return job.command
+        return (*job.command, *extra, "--overwrite" if job.kind == "dataset" else "--fresh")
+
+    def _record(self, job: Job, seconds: float, units: int, threads: int) -> None:
+        """Keep the time of a sitting."""
+        identity = self._inventory().identity(job.kind, job.cell)
+        self._timings().add(Timing(
+            job.name, round(seconds, 1), units, job.finding.unit, identity, threads, self.jobs, hardware(),
+            datetime.now(UTC).isoformat(timespec="seconds"), "velap " + " ".join(job.command), code_version()))
+
+    def _note_training_times(self) -> None:
+        """Training times that only a checkpoint knows, because it was trained by hand, go where a table finds them."""
+        timings = self._timings()
+        jobs, _ = self._plan(dataclasses.replace(everything(), presets=("default", "paper"), seeds=self._seeds()))
+        for job in jobs:
+            seconds, known = job.finding.seconds, timings.get(job.name)
+            if seconds is None or not job.finding.finished:
+                continue
+            identity = self._inventory().identity(job.kind, job.cell)
+            if known is None or known.identity != identity:
+                timings.add(Timing(job.name, seconds, job.finding.total, job.finding.unit, identity, 0, 0, "", "",
+                                   "velap " + " ".join(job.command), ""))
+
+    def _seeds(self) -> tuple[int, ...]:
+        """Training seeds that are asked for or recorded."""
+        found = {path.stem.removeprefix("train") for path in self.options.records.glob("*/*/train*.jsonl")}
+        return tuple(sorted({int(seed) for seed in found if seed.isdecimal()} | set(self.selection.seeds)))
+
+
+def _raise_failures(outcome: Outcome, total: int) -> None:
+    if outcome.failed:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
+        raise VelapError(f"{len(outcome.failed)} of {total} jobs failed and {len(outcome.skipped)} that need them were "
+                         f"skipped: {reasons}. The others are done and the table is written; repair the cause and repeat "
+                         "the command.")
+
+
+def _move_aside(folder: Path) -> None:
+    """Rename a run directory to `NAME.old-1`, or the next number that is free."""
+    number = next(n for n in range(1, 10_000) if not folder.with_name(f"{folder.name}.old-{n}").exists())
+    folder.rename(folder.with_name(f"{folder.name}.old-{number}"))
+
+
+@contextlib.contextmanager
+def _only_one(path: Path) -> Iterator[None]:
+    """Hold the lock of this table; the kernel releases it however the process ends."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise VelapError(f"another `velap table 1` is running here (it holds {path}); expected to be alone. Wait for "
+                             "it, or raise its --jobs.") from error
+        yield
