@@ -1,12 +1,10 @@
 """SpiralMaze in MuJoCo: speed, walls, goal, expert, the share of successful transitions."""
 
-import gymnasium
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import velap.envs  # noqa: F401 - registers the tasks
 from velap.envs.block_maze import MAX_SPEED, STEP_LENGTH, SpiralMaze
 from velap.envs.spiral import PIXEL
 from velap.errors import ConfigError
@@ -159,26 +157,3 @@ def test_random_walks_succeed_in_about_0_12_percent_of_transitions(maze):
                     break
                 action = np.clip(action + rng.normal(0, recipe.action_noise, 2), -1, 1)
     assert 0.08 <= 100 * successes / transitions <= 0.20
-
-
-def test_the_time_limit_truncates_after_300_steps():
-    env = gymnasium.make("velap/SpiralMaze-v0")
-    env.reset(seed=0)
-    steps = 0
-    done = False
-    while not done:
-        _, reward, terminated, truncated, _ = env.step(np.zeros(2, np.float32))
-        steps += 1
-        done = terminated or truncated
-    assert (steps, reward, terminated, truncated) == (300, 0.0, False, True)
-
-
-def test_the_expert_never_sees_a_false_reward(maze):
-    maze.reset(seed=5)
-    rewards = []
-    done = False
-    while not done:
-        _, reward, done, _, _ = maze.step(maze.expert_action())
-        rewards.append(reward)
-    assert rewards[-1] == 1.0
-    assert sum(rewards) == 1.0
