@@ -298,6 +298,10 @@ def test_the_card_and_its_pictures_show_what_is_in_the_dataset():
     assert f"- SHA-256 of the arrays: {store.content_hash}" in result.card
     assert "- made by: `velap collect Line --seed 3`" in result.card
     assert "- episodes: 24 of " in result.card
+    assert f"- random-walk: 24 trajectories, {result.successes} of them successful" in result.card
+    assert "where test episodes start" not in result.card
+    told = cards.dataset_card(store, provenance={"from_test": 2})
+    assert "- trajectories from where test episodes start to success: 2" in told
     assert (result.path / "card.md").read_text().startswith(result.card)
     bars = [line for line in result.card.splitlines() if "│" in line]
     assert [int(line.split()[-1]) for line in bars] == [*np.bincount(store.episode_length, minlength=7)[1:],

@@ -77,8 +77,8 @@ BEHAVIOURS: dict[str, Behaviour] = {"random-walk": random_walk, "noisy-expert": 
 MIXTURES: dict[str, Mapping[str, float]] = {
     "WindowClose": {"random-walk": 0.36, "noisy-expert": 0.64},
     "FaucetClose": {"random-walk": 0.39, "noisy-expert": 0.61},
-    "ButtonWall": {"random-walk": 0.87, "noisy-expert": 0.13},
-    "DrawerButton": {"random-walk": 0.5, "noisy-expert": 0.5},
+    "ButtonWall": {"random-walk": 0.86, "noisy-expert": 0.14},
+    "DrawerButton": {"random-walk": 0.7, "noisy-expert": 0.3},
 }
 """Share of trajectories of each behaviour, by task; tasks that are not named use the random walk alone."""
 
@@ -110,7 +110,8 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
 
     Returns:
         frames uint8 [T+1, H, W, 3], actions float32 [T+1, A], rewards float32 [T+1], terminated and truncated bool [T+1],
-        positions float32 [T+1, P]; length, reset_seed, context, behaviour int64 [1].
+        positions float32 [T+1, P]; length, reset_seed, context, behaviour, from_test int64 [1]. `from_test` is 1 if it leads
+        from where test episodes start to a reward, else 0, or -1 where the environment does not tell.
     """
     reset_stream, policy_stream = np.random.SeedSequence(entropy=seed, spawn_key=(context, trajectory)).spawn(2)
     reset_seed = int(reset_stream.generate_state(1)[0])
@@ -119,6 +120,8 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
     chosen = int(rng.choice(len(names), p=[shares[name] for name in names]))
     frame, _ = env.reset(seed=reset_seed, options=reset_options(context))
     policy = BEHAVIOURS[names[chosen]](env, recipe, rng)
+    in_test_region = getattr(env.unwrapped, "in_test_region", lambda: False)
+    visited = in_test_region()
     frames, positions = [np.array(frame)], [position_of(env)]
     steps: list[tuple[np.ndarray, float, bool, bool]] = []
     while len(steps) < recipe.max_steps:
@@ -130,6 +133,7 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
         steps.append((action, float(reward), bool(terminated), bool((truncated or full) and not terminated)))
         if terminated or truncated:
             break
+        visited = visited or in_test_region()
     actions, rewards, ends, cuts = zip(*steps, strict=True)
     return {
         "frames": np.stack(frames),
@@ -142,4 +146,5 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
         "reset_seed": np.array([reset_seed]),
         "context": np.array([context]),
         "behaviour": np.array([chosen]),
+        "from_test": np.array([int(visited and rewards[-1] > 0) if hasattr(env.unwrapped, "in_test_region") else -1]),
     }

@@ -50,7 +50,7 @@ def dataset_card(store: FrameStore, task: Task | None = None, positions: np.ndar
         store: the dataset.
         task: the task that it belongs to, for the numbers of Table 10; None for a stranger's.
         positions: float [F, P] position of the agent at each frame [m], for its range.
-        provenance: what `collect` kept (`command`), if it did.
+        provenance: what `collect` kept (`command`, `behaviours`, `from_test`), if it did.
     """
     successes, transitions = int(store.rewards.sum()), store.n_transitions
     share = 100.0 * successes / transitions
@@ -75,6 +75,10 @@ def dataset_card(store: FrameStore, task: Task | None = None, positions: np.ndar
     if positions is not None:
         lines.append(f"- positions: from {_numbers(positions.min(axis=0))} to {_numbers(positions.max(axis=0))} m")
     lines.append(f"- SHA-256 of the arrays: {store.content_hash}")
+    for name, (count, wins) in (provenance or {}).get("behaviours", {}).items():
+        lines.append(f"- {name}: {count:,} trajectories, {wins:,} of them successful")
+    if provenance and provenance.get("from_test") is not None:
+        lines.append(f"- trajectories from where test episodes start to success: {provenance['from_test']}")
     if provenance and provenance.get("command"):
         lines.append(f"- made by: `{provenance['command']}`")
     lines += ["", "Episode length [steps]:", "", *_length_histogram(store.episode_length), "", "Episode return:", "",

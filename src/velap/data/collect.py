@@ -32,7 +32,7 @@ SHARD_TRAJECTORIES = 10
 """Trajectories a shard: what a kill costs at most, a worker. ours."""
 PLAN_FILE = "plan.json"
 _ROW_ARRAYS = ("frames", "actions", "rewards", "terminated", "truncated", "positions")
-_EPISODE_ARRAYS = ("length", "reset_seed", "context", "behaviour")
+_EPISODE_ARRAYS = ("length", "reset_seed", "context", "behaviour", "from_test")
 
 
 @dataclass(frozen=True)
@@ -157,12 +157,22 @@ def _describe(running: list[Worker], env_id: str) -> dict[str, Any]:
     return descriptions[0]
 
 
+def _composition(store: FrameStore, arrays: dict[str, np.ndarray], names: list[str]) -> dict[str, Any]:
+    """For the card: trajectories and successes by behaviour, and how many lead from where tests start to a success."""
+    won = cards.episode_returns(store) > 0
+    chosen = [arrays["behaviour"] == number for number in range(len(names))]
+    counts = {name: [int(rows.sum()), int(won[rows].sum())] for name, rows in zip(names, chosen, strict=True)}
+    told = arrays["from_test"][arrays["from_test"] >= 0]
+    return {"behaviours": counts, "from_test": int(told.sum()) if len(told) else None}
+
+
 def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, Any], provenance: dict[str, Any],
            dataset_id: str) -> tuple[FrameStore, Path, str]:
     """Write the dataset and its card from the shards; gives the store, the dataset's directory and the card."""
     store, arrays = _assemble(work / "shards", _shards(task), description, dataset_id)
     recipe, names = task.recipe, sorted(plan["shares"])
     positions = arrays["positions"] if arrays["positions"].shape[1] else None
+    provenance = {**provenance, **_composition(store, arrays, names)}
     extras = Extras(
         positions=positions,
         seeds=arrays["reset_seed"].tolist(),
