@@ -75,8 +75,8 @@ def agreement(jobs: Sequence[Job], forecast: Forecast) -> list[str]:
         return []
     took, expected = (sum(values) for values in zip(*pairs, strict=True))
     within = sum(2 / 3 <= measured / foretold <= 4 / 3 for measured, foretold in pairs)
-    return [f"{len(pairs)} jobs are measured: {duration(took)} where {duration(expected)} were foretold; "
-            f"{within} of them within a third."]
+    return [f"Measured jobs: {len(pairs)}, which took {duration(took)} where {duration(expected)} were foretold; {within} of "
+            "them are within a third."]
 
 
 class JobsView:
