@@ -297,6 +297,9 @@ def test_the_card_and_its_pictures_show_what_is_in_the_dataset():
     assert f"- successful transitions: {result.successes} ({share:.2f} %), the paper's is 1.00 % (Table 10)" in result.card
     assert f"- SHA-256 of the arrays: {store.content_hash}" in result.card
     assert "- made by: `velap collect Line --seed 3`" in result.card
+    for line in ("contexts | 1 | 1", "trajectories a context | 24 | 24", "longest trajectory [steps] | 6 | 6",
+                 f"successful transitions [%] | {share:.2f} | 1.00"):
+        assert f"| {line} |" in result.card
     assert "- episodes: 24 of " in result.card
     assert f"- random-walk: 24 trajectories, {result.successes} of them successful" in result.card
     assert "where test episodes start" not in result.card
@@ -313,6 +316,26 @@ def test_the_card_and_its_pictures_show_what_is_in_the_dataset():
     coverage = np.asarray(Image.open(result.path / "coverage.png").convert("RGB"))
     assert min(coverage.shape[:2]) >= 500
     assert len(np.unique(coverage.reshape(-1, 3), axis=0)) > 50
+
+
+def test_coverage_in_space_is_shown_from_above_and_from_the_front(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    from matplotlib.axes import Axes
+
+    drawn, scatter = [], Axes.scatter
+    monkeypatch.setattr(Axes, "scatter", lambda self, x, y, **style: drawn.append((style["label"], np.stack([x, y], -1)))
+                        or scatter(self, x, y, **style))
+    store = a_store(collect.collect(TASK, seed=3, workers=1))
+    drawn.clear()
+    positions = np.random.default_rng(0).normal(size=(len(store.frames), 3))
+    cards.draw_coverage(store, positions, tmp_path / "coverage.png", {"test_starts": [[1.0, 2.0, 3.0]]})
+    ends = positions[store.episode_start + store.episode_length]
+    won = ends[cards.episode_returns(store) > 0]
+    expected = [("visited", positions), ("starts", positions[store.episode_start]),
+                ("test starts", np.array([[1.0, 2.0, 3.0]])), ("successes", won)]
+    assert len(drawn) == 8 and len(won) > 0
+    for (label, points), (name, places), plane in zip(drawn, expected * 2, [[0, 1]] * 4 + [[0, 2]] * 4, strict=True):
+        assert label == f"{name} ({len(places):,})"
+        np.testing.assert_array_equal(points, places[:, plane])
 
 
 def _first_frame_of_a_success(store: FrameStore) -> np.ndarray:

@@ -130,6 +130,15 @@ def noisy_expert(env: gymnasium.Env[Any, Any], recipe: Recipe, rng: np.random.Ge
     return lambda frame: np.clip(world.expert_action() + rng.normal(0, 0.1, shape), -1, 1).astype(np.float32)
 
 
+def test_test_episodes_start_in_the_test_region_and_far_from_success(task):
+    world: Any = made(task).unwrapped
+    for seed in range(5):
+        world.start({"split": "test"}, seed)
+        assert world.in_test_region()
+        assert world.in_test_region(world.agent_position())
+        assert not world.succeeded()
+
+
 def test_a_stored_trajectory_replays_to_the_same_states_and_pixels(task, tmp_path, monkeypatch):
     """Action t leads from frame t to frame t + 1. Collected by the real thing, but in this process."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))

@@ -50,7 +50,7 @@ def dataset_card(store: FrameStore, task: Task | None = None, positions: np.ndar
         store: the dataset.
         task: the task that it belongs to, for the numbers of Table 10; None for a stranger's.
         positions: float [F, P] position of the agent at each frame [m], for its range.
-        provenance: what `collect` kept (`command`, `behaviours`, `from_test`), if it did.
+        provenance: what `collect` kept (`command`, `contexts`, `behaviours`, `from_test`), if it did.
     """
     successes, transitions = int(store.rewards.sum()), store.n_transitions
     share = 100.0 * successes / transitions
@@ -81,9 +81,22 @@ def dataset_card(store: FrameStore, task: Task | None = None, positions: np.ndar
         lines.append(f"- trajectories from where test episodes start to success: {provenance['from_test']}")
     if provenance and provenance.get("command"):
         lines.append(f"- made by: `{provenance['command']}`")
+    if task is not None:
+        lines += _against_table_10(store, task, share, (provenance or {}).get("contexts"))
     lines += ["", "Episode length [steps]:", "", *_length_histogram(store.episode_length), "", "Episode return:", "",
               *_histogram(episode_returns(store), [-0.5, 0.5, 1.5], ["0", "1"]), ""]
     return "\n".join(lines)
+
+
+def _against_table_10(store: FrameStore, task: Task, share: float, trajectories: Sequence[int] | None) -> list[str]:
+    """A table of what is here and in the paper; share of successful transitions [%], `trajectories` of each context."""
+    each = "-" if not trajectories else "–".join(str(count) for count in sorted({min(trajectories), max(trajectories)}))
+    recipe = task.recipe
+    return ["", "| | here | Table 10 |", "| --- | --- | --- |",
+            f"| contexts | {len(trajectories) if trajectories else '-'} | {recipe.contexts} |",
+            f"| trajectories a context | {each} | {recipe.trajectories} |",
+            f"| longest trajectory [steps] | {store.episode_length.max()} | {recipe.max_steps} |",
+            f"| successful transitions [%] | {share:.2f} | {recipe.success_percent:.2f} |"]
 
 
 def _numbers(values: np.ndarray) -> str:
@@ -97,31 +110,41 @@ def _empty_scene(frames: np.ndarray, samples: int = 200) -> np.ndarray:
 
 
 def draw_coverage(store: FrameStore, positions: np.ndarray, path: Path, provenance: dict[str, Any] | None = None) -> None:
-    """Where the agent was: positions [F, P ≥ 2] [m], starts, successes and test starts, over the scene where it is known."""
+    """Where the agent was: positions [F, P ≥ 2] [m], starts, successes and test starts, over the scene where it is known.
+
+    Three entries are shown from above and from the front.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     kept = provenance or {}
+    planes = [(0, 1), (0, 2)] if positions.shape[1] > 2 else [(0, 1)]
     figure = Figure(figsize=(7, 7), layout="constrained")
-    axes = figure.add_subplot()
-    if len(kept.get("extent", ())) == 4:
-        axes.imshow(_empty_scene(store.frames), extent=tuple(kept["extent"]), alpha=0.45)
-    hits = np.flatnonzero(store.rewards > 0) + 1
-    starts = positions[store.episode_start]
+    figure.suptitle(f"{store.dataset_id}: coverage")
+    for axes, plane in zip(figure.subplots(len(planes), 1, squeeze=False)[:, 0], planes, strict=True):
+        if len(kept.get("extent", ())) == 4:
+            axes.imshow(_empty_scene(store.frames), extent=tuple(kept["extent"]), alpha=0.45)
+        for points, label, style in _coverage_layers(store, positions, kept):
+            axes.scatter(points[:, plane[0]], points[:, plane[1]], label=f"{label} ({len(points):,})", **style)
+        axes.set(xlabel=f"{'xyz'[plane[0]]} [m]", ylabel=f"{'xyz'[plane[1]]} [m]", aspect="equal")
+    handles = axes.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=4, frameon=False, fontsize="small", markerscale=1.5)
+    FigureCanvasAgg(figure).print_png(str(path))
+
+
+def _coverage_layers(store: FrameStore, positions: np.ndarray,
+                     kept: dict[str, Any]) -> list[tuple[np.ndarray, str, dict[str, Any]]]:
+    """Points [*, P] of the coverage plot, their name, their style; the lowest layer first."""
     layers: list[tuple[np.ndarray, str, dict[str, Any]]] = [
         (positions, "visited", {"s": 2, "color": "0.25", "alpha": 0.35, "linewidths": 0}),
-        (starts, "starts", {"s": 7, "color": "tab:blue", "linewidths": 0}),
+        (positions[store.episode_start], "starts", {"s": 7, "color": "tab:blue", "linewidths": 0}),
     ]
     tests = np.asarray(kept.get("test_starts", []), dtype=np.float64)
-    if tests.ndim == 2 and tests.shape[1] >= 2:
+    if tests.ndim == 2 and tests.shape[1] == positions.shape[1]:
         layers.append((tests, "test starts", {"s": 14, "marker": "x", "color": "tab:green", "linewidths": 0.9}))
     stars = {"s": 60, "marker": "*", "color": "gold", "edgecolors": "black", "linewidths": 0.6}
-    layers.append((positions[hits], "successes", stars))
-    for points, label, style in layers:
-        axes.scatter(points[:, 0], points[:, 1], label=f"{label} ({len(points):,})", **style)
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=f"{store.dataset_id}: coverage")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=4, frameon=False, fontsize="small", markerscale=1.5)
-    FigureCanvasAgg(figure).print_png(str(path))
+    layers.append((positions[np.flatnonzero(store.rewards > 0) + 1], "successes", stars))
+    return layers
 
 
 def draw_frames(store: FrameStore, path: Path) -> None:

@@ -158,12 +158,14 @@ def _describe(running: list[Worker], env_id: str) -> dict[str, Any]:
 
 
 def _composition(store: FrameStore, arrays: dict[str, np.ndarray], names: list[str]) -> dict[str, Any]:
-    """For the card: trajectories and successes by behaviour, and how many lead from where tests start to a success."""
+    """For the card: trajectories of each context; trajectories and successes by behaviour; how many lead from where tests
+    start to a success."""
     won = cards.episode_returns(store) > 0
     chosen = [arrays["behaviour"] == number for number in range(len(names))]
     counts = {name: [int(rows.sum()), int(won[rows].sum())] for name, rows in zip(names, chosen, strict=True)}
     told = arrays["from_test"][arrays["from_test"] >= 0]
-    return {"behaviours": counts, "from_test": int(told.sum()) if len(told) else None}
+    contexts = np.unique(arrays["context"], return_counts=True)[1].tolist()
+    return {"contexts": contexts, "behaviours": counts, "from_test": int(told.sum()) if len(told) else None}
 
 
 def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, Any], provenance: dict[str, Any],
