@@ -75,9 +75,9 @@ def noisy_expert(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Poli
 BEHAVIOURS: dict[str, Behaviour] = {"random-walk": random_walk, "noisy-expert": noisy_expert}
 """Behaviours by name."""
 MIXTURES: dict[str, Mapping[str, float]] = {
-    "WindowClose": {"random-walk": 0.36, "noisy-expert": 0.64},
-    "FaucetClose": {"random-walk": 0.39, "noisy-expert": 0.61},
-    "ButtonWall": {"random-walk": 0.86, "noisy-expert": 0.14},
+    "WindowClose": {"random-walk": 0.43, "noisy-expert": 0.57},
+    "FaucetClose": {"random-walk": 0.41, "noisy-expert": 0.59},
+    "ButtonWall": {"random-walk": 0.835, "noisy-expert": 0.165},
     "DrawerButton": {"random-walk": 0.7, "noisy-expert": 0.3},
 }
 """Share of trajectories of each behaviour, by task; tasks that are not named use the random walk alone."""

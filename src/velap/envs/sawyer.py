@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from velap.envs.gl import mujoco
 from velap.envs.pixels import FRAME_SIZE, Frame, PixelTask
@@ -79,8 +79,12 @@ def scene_xml(objects: tuple[str, ...], bodies: str) -> str:
 class Box:
     """An axis-aligned region of hand positions [m]."""
 
-    def __init__(self, low: tuple[float, ...], high: tuple[float, ...]) -> None:
+    def __init__(self, low: ArrayLike, high: ArrayLike) -> None:
         self.low, self.high = np.array(low, np.float64), np.array(high, np.float64)
+
+    def around(self, centre: Vector, half_sizes: tuple[float, float, float]) -> Box:
+        """The part of this box within half_sizes[3] of centre[3] [m]."""
+        return Box(np.maximum(self.low, centre - half_sizes), np.minimum(self.high, centre + half_sizes))
 
     def sample(self, rng: np.random.Generator) -> Vector:
         """A uniform point [3] [m]."""

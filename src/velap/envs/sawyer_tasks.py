@@ -46,8 +46,7 @@ class _NearOrAnywhere(SawyerTask):
             return self.test_starts.sample(rng)
         if rng.random() >= self.near_share:
             return self.data_starts.sample(rng)
-        near = self.handle() + rng.uniform(-1.0, 1.0, 3) * self.near_box
-        return np.clip(near, self.data_starts.low, self.data_starts.high)
+        return self.data_starts.around(self.handle(), self.near_box).sample(rng)
 
     def in_test_region(self, position: Vector | None = None) -> bool:
         """Inside the box of the test starts?"""
@@ -296,7 +295,7 @@ class DrawerButton(SawyerTask):
         limits = self.hand_limits
         if rng.random() >= self.near_share:
             return limits.sample(rng)
-        return np.clip(self._goal() + rng.uniform(-1.0, 1.0, 3) * self.near_box, limits.low, limits.high)
+        return limits.around(self._goal(), self.near_box).sample(rng)
 
     def in_test_region(self, position: Vector | None = None) -> bool:
         """In the box of the test starts, with the drawer open?"""
