@@ -94,7 +94,13 @@ def test_a_view_projects_to_pixels_and_knows_what_is_beside_it() -> None:
     np.testing.assert_allclose(view.pixels(np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], [1.0, 0.5, 0.5]]), 64),
                                [[64, 32], [32, 0], [48, 16]], atol=1e-9)
     centres = np.array([[0.0, 2.1, 0.0], [0.0, 2.1, 0.0], [0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
-    assert view.beside(centres, np.array([0.01, 0.2, 0.01, 0.01])).tolist() == [True, False, False, True]
+    halves, still = np.full((4, 3), 0.01), np.broadcast_to(np.eye(3), (4, 3, 3))
+    halves[1, 0] = 0.2  # towards the frame
+    assert view.beside(centres, still, halves).tolist() == [True, False, False, True]
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    halves[1] = 0.01, 0.2, 0.01
+    assert view.beside(centres, quarter @ still, halves).tolist() == [True, False, False, True]
+    assert view.beside(centres, still, np.array([[0.01, 0.01, 9.0]] * 4)).tolist() == [True, True, False, True]
     cube = meshes.box(np.full(3, 0.1))
     seen = view.facing(merged([cube, cube.moved(np.array([0.0, 9.0, 0.0]), np.eye(3))]))
     assert len(seen) == 2

@@ -21,8 +21,8 @@ from velap.envs.gl import mujoco
 from velap.envs.meshes import Array, Mesh
 from velap.envs.view import View
 
-CELL = 0.02
-"""Side of the cubes within which vertices of a mesh are drawn together [m]. ours: 1.3 px at the middle of the view."""
+CELL = 0.015
+"""Side of the cubes within which vertices of a mesh are drawn together [m]. ours: one pixel at the middle of the view."""
 
 SMALL_MESH = 1000
 """Meshes of up to so many triangles stay as they are. ours: those of all objects; the arm's have 2,400 and more."""
@@ -79,20 +79,22 @@ class Block:
 
 
 def collect_parts(model: Any, view: View) -> list[Part]:
-    """All that may show, one part for each body that carries some and each look."""
+    """All that may show, one part for each body that carries some and each look, and for each large mesh."""
     data = _at_rest(model)
-    found: dict[tuple[int, Look], list[Mesh]] = defaultdict(list)
-    for body, look, surface, position, rotation in _surfaces(model, data):
+    found: dict[tuple[int, Look, int], list[Mesh]] = defaultdict(list)
+    for number, (body, look, surface, position, rotation) in enumerate(_surfaces(model, data)):
         anchor = _anchor(model, body)
         placed = surface.moved(position, rotation)
         if anchor == 0:
             placed = view.facing(placed)
-        if len(placed) > SMALL_MESH:
+        large = len(placed) > SMALL_MESH
+        if large:
             placed = meshes.simplified(placed, CELL)
         if len(placed):
             turn = data.xmat[anchor].reshape(3, 3).T
-            found[anchor, look].append(placed.moved(-turn @ data.xpos[anchor], turn))
-    return [Part(body, look, meshes.merged(surfaces)) for (body, look), surfaces in found.items()]
+            # a large one stays alone: it may be beside the frame when the others are not
+            found[anchor, look, number if large else -1].append(placed.moved(-turn @ data.xpos[anchor], turn))
+    return [Part(body, look, meshes.merged(surfaces)) for (body, look, _), surfaces in found.items()]
 
 
 def collect_blocks(model: Any, view: View) -> list[Block]:

@@ -46,8 +46,10 @@ class SawyerScene:
         drawn.mocap_pos[:] = data.xpos[self._bodies]
         drawn.mocap_quat[:] = data.xquat[self._bodies]
         mujoco.mj_kinematics(self.model, drawn)
-        # a part whose bounding ball is beside the frame would only cost: its group hides it
-        self.model.geom_group[:] = _HIDDEN_GROUP * self.view.beside(drawn.geom_xpos, self.model.geom_rbound)
+        # a part whose bounding box is beside the frame would only cost: its group hides it
+        rotations = drawn.geom_xmat.reshape(-1, 3, 3)
+        centres = drawn.geom_xpos + np.einsum("gij,gj->gi", rotations, self.model.geom_aabb[:, :3])
+        self.model.geom_group[:] = _HIDDEN_GROUP * self.view.beside(centres, rotations, self.model.geom_aabb[:, 3:])
         return shared_renderer(self._assets, self.model, size).draw(self.model, drawn)
 
 
@@ -71,15 +73,18 @@ class OriginalScene:
 def _drawing_model(model: Any, parts: list[Part], bodies: list[int], view: View) -> Any:
     """A model of the parts on the mocap bodies `bodies`, the textured boxes, the lights and the camera."""
     spec = mujoco.MjSpec()
-    carriers = {0: spec.worldbody} | {body: spec.worldbody.add_body(mocap=True) for body in bodies}
-    for number, part in enumerate(parts):
-        _add_part(spec, carriers[part.body], f"part{number}", part)
+    spec.visual.quality.numquads = 1  # a side of a box needs no raster of vertices under lights from afar
+    carriers = {body: spec.worldbody.add_body(mocap=True) for body in bodies}
+    # geoms are drawn in the order of their bodies: what is behind comes last, so that hidden pixels cost nothing
+    carriers[0] = spec.worldbody.add_body()
     for number, block in enumerate(collect_blocks(model, view)):
         name = f"block{number}"
         _add_material(spec, name, block.look, shrunk_texture(model, block.material))
-        geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=block.half_size, pos=block.position,
+        geom = carriers[0].add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=block.half_size, pos=block.position,
                                        material=name, contype=0, conaffinity=0)
         mujoco.mju_mat2Quat(geom.quat, block.rotation.ravel())
+    for number, part in reversed(list(enumerate(parts))):
+        _add_part(spec, carriers[part.body], f"part{number}", part)
     _add_lights(spec, model)
     camera = spec.worldbody.add_camera(pos=view.position, fovy=view.fovy)
     mujoco.mju_mat2Quat(camera.quat, view.axes.T.ravel())

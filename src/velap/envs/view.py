@@ -43,9 +43,10 @@ class View:
         """points[*, 3] -> how far they are inside each of the four planes [*, 4] [m]; negative outside."""
         return (points - self.position) @ self.sides
 
-    def beside(self, centres: Array, radii: Array) -> NDArray[np.bool_]:
-        """Are balls round centres[*, 3] with radii[*] [m] wholly beside the frame? bool[*]."""
-        return np.any(self.depths(centres) < -radii[..., None], axis=-1)
+    def beside(self, centres: Array, rotations: Array, half_sizes: Array) -> NDArray[np.bool_]:
+        """Are boxes wholly beside the frame? bool[*] for centres[*, 3] [m], rotations[*, 3, 3], half_sizes[*, 3] [m]."""
+        reach = np.einsum("...jp,...j->...p", np.abs(np.swapaxes(rotations, -1, -2) @ self.sides), half_sizes)
+        return np.any(self.depths(centres) < -reach, axis=-1)
 
     def pixels(self, points: Array, size: int) -> Array:
         """points[*, 3] [m] -> column and row [*, 2] in a frame of `size` [px], from the upper left corner."""
