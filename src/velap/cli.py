@@ -286,16 +286,25 @@ def study(subject: Annotated[Positional[Literal["faults", "experts"]],
         study_experts(OUT, quick, seed, write, json)
 
 
-def figure(name: Annotated[Positional[Literal["sawyer-drawing"]], arg(help="What to draw.")],
+def figure(name: Annotated[Positional[Literal["tasks", "sawyer-drawing"]], arg(help="What to draw.")],
            write: Path | None = None) -> None:
-    """Draw a picture of the documentation anew: `sawyer-drawing`, our drawing of the arm beside Meta-World's geometry.
+    """Draw a picture of the documentation anew.
+
+    `tasks`: test start and goal state of every task, as an agent sees them. `sawyer-drawing`: our drawing of the arm beside
+    Meta-World's geometry.
 
     Args:
         write: Where it goes; docs/NAME.png (with _ for -) unless said.
     """
-    from velap.bench.drawing import show_drawing
+    path = write or Path("docs") / f"{name.replace('-', '_')}.png"
+    if name == "tasks":
+        from velap.bench.gallery import show_tasks
 
-    show_drawing(OUT, write or Path("docs") / f"{name.replace('-', '_')}.png")
+        show_tasks(OUT, path)
+    else:
+        from velap.bench.drawing import show_drawing
+
+        show_drawing(OUT, path)
 
 
 def info() -> None:

@@ -43,8 +43,8 @@ class Trials:
     """Time limit [steps]."""
     expert: int
     """Episodes that the expert solved."""
-    expert_steps: float
-    """Mean length of those [steps]."""
+    expert_steps: float | None
+    """Mean length of those [steps]; None where there is none."""
     longest: int
     """Longest of those [steps]."""
     random: int
@@ -115,9 +115,11 @@ def try_task(task: Task, seeds: Sequence[int], on_episode: Callable[[int], objec
         lucky += episode(world, uniform(world.action_space, seed), seed, task.max_steps) is not None
         held += maze and heading_solves(world, seed, task.max_steps)
         on_episode(seed)
-    lines = {"straight": _sight_lines(world, seeds), "held": held, "other_straight": _sight_lines(world, OTHER_SEEDS)}
-    return Trials(task.name, seeds[0], len(seeds), task.max_steps, len(lengths), float(np.mean(lengths or np.nan)),
-                  max(lengths, default=0), lucky, **(lines if maze else {}))
+    lines: dict[str, int] = {}
+    if maze:
+        lines = {"straight": _sight_lines(world, seeds), "held": held, "other_straight": _sight_lines(world, OTHER_SEEDS)}
+    return Trials(task.name, seeds[0], len(seeds), task.max_steps, len(lengths),
+                  float(np.mean(lengths)) if lengths else None, max(lengths, default=0), lucky, **lines)
 
 
 def study_experts(console: Console, quick: bool = False, first_seed: int = 0, write: Path | None = None,
@@ -144,7 +146,8 @@ def table(trials: Sequence[Trials]) -> str:
     """Markdown rows."""
     head = ("| task | time limit [steps] | expert | mean steps | longest | uniform actions | straight line | held heading "
             "| straight line, other seeds |\n" + "| --- " * 9 + "|")
-    rows = [f"| {entry.task} | {entry.max_steps} | {entry.expert} of {entry.episodes} | {entry.expert_steps:.1f} | "
+    rows = [f"| {entry.task} | {entry.max_steps} | {entry.expert} of {entry.episodes} | "
+            f"{'-' if entry.expert_steps is None else f'{entry.expert_steps:.1f}'} | "
             f"{entry.longest} | {entry.random} of {entry.episodes} | {_count(entry.straight, entry.episodes)} | "
             f"{_count(entry.held, entry.episodes)} | {_count(entry.other_straight, len(OTHER_SEEDS))} |" for entry in trials]
     return "\n".join([head, *rows])

@@ -121,7 +121,7 @@ def draw_coverage(store: FrameStore, positions: np.ndarray, path: Path, provenan
     planes = [(0, 1), (0, 2)] if positions.shape[1] > 2 else [(0, 1)]
     figure = Figure(figsize=(7, 7), layout="constrained")
     figure.suptitle(f"{store.dataset_id}: coverage")
-    for axes, plane in zip(figure.subplots(len(planes), 1, squeeze=False)[:, 0], planes, strict=True):
+    for axes, plane in zip(figure.subplots(len(planes), 1, squeeze=False, sharex=True)[:, 0], planes, strict=True):
         if len(kept.get("extent", ())) == 4:
             axes.imshow(_empty_scene(store.frames), extent=tuple(kept["extent"]), alpha=0.45)
         for points, label, style in _coverage_layers(store, positions, kept):
