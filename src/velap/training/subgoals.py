@@ -25,8 +25,8 @@ class SubgoalConfig(LearnerConfig):
     horizon: int = 10
     """n, how far ahead a subgoal lies [steps]. D.7: 5 for the multi-step variant. ours: 10 for IRIS, the default of its
     authors' code (robomimic)."""
-    kl_weight: float = 0.01
-    """β of the cVAE, Table 4."""
+    kl_weight: float = 1.0
+    """β of the cVAE. ours: Table 4's 0.01 is for actions; on latents it leaves holes in the prior (docs/decisions.md)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
