@@ -13,15 +13,17 @@ from table_cells import Pretended, fill, inventory
 from velap import cli
 from velap.bench import forecast, jobs_view
 from velap.bench.forecast import Forecast
-from velap.bench.inventory import checkpoint_path
+from velap.bench.inventory import checkpoint_metadata, checkpoint_path
 from velap.bench.jobs import Job, Options, make_plan
 from velap.bench.matrix import Cell, Selection, everything, parse_only
 from velap.bench.paper import METHODS, TABLE_1
 from velap.bench.schedule import Schedule, makespan
 from velap.bench.table_command import TableOne
 from velap.bench.timings import Timing, Timings
+from velap.config import override
 from velap.errors import ConfigError, UnknownTaskError
 from velap.models.heads import HEADS
+from velap.models.latent import WEIGHTS_SHA256, LatentModel, Spaces, save_checkpoint
 from velap.tasks import make_config
 
 SPIRAL = Cell("SpiralMaze", "velap", "default", 0)
@@ -221,3 +223,40 @@ def test_a_run_of_another_config_is_no_joint_checkpoint() -> None:
     found = inventory().joint("SpiralMaze", "default", 0)
     assert (found.done, found.finished) == (0, False)
     assert f"train.c1 is 0.5 there and {config.train.c1!r} today" in found.problem
+
+
+def save_untrained(path: Path, seed: int, **changes: dict[str, object]) -> str:
+    """A checkpoint of the default config with random weights; returns the hash of its weights."""
+    config = override(make_config("SpiralMaze"), **changes)
+    model = LatentModel(config.model, Spaces(64, 64, (-1.0,) * 2, (1.0,) * 2), config.train.discount)
+    save_checkpoint(path, model, config, {"seed": str(seed), "train_seconds": "90"})
+    metadata = checkpoint_metadata(path)
+    assert metadata is not None
+    return metadata[WEIGHTS_SHA256]
+
+
+def test_a_released_checkpoint_stands_for_the_joint_training() -> None:
+    released = Path("checkpoints/SpiralMaze.safetensors")
+    weights = save_untrained(released, seed=0)
+    found = inventory().joint("SpiralMaze", "default", 0)
+    assert (found.finished, found.seconds) == (True, 90.0)
+    assert not inventory().joint("SpiralMaze", "default", 1).finished, "of another training seed"
+    assert not inventory().joint("SpiralMaze", "paper", 0).finished
+    fill(SPIRAL, [True] * 4, checkpoint=weights)
+    assert inventory().evaluation(SPIRAL).finished
+    TableOne(parse_only(["task=SpiralMaze", "method=velap"]))._adopt_released()
+    assert checkpoint_path("SpiralMaze", "default", 0).read_bytes() == released.read_bytes()
+    assert inventory().evaluation(SPIRAL).finished
+
+
+def test_records_of_another_checkpoint_than_the_one_there_are_outdated() -> None:
+    fill(SPIRAL, [True] * 4, checkpoint="0123456789abcdef")
+    assert inventory().evaluation(SPIRAL).finished, "no checkpoint is there to compare with"
+    path = checkpoint_path("SpiralMaze", "default", 0)
+    weights = save_untrained(path, seed=0)
+    assert inventory().evaluation(SPIRAL).problem == f"its `checkpoint` is 0123456789ab, that of today {weights[:12]}"
+    save_untrained(path, seed=0, planner={"n_iter": 7})
+    found = inventory().joint("SpiralMaze", "default", 0)
+    assert (found.finished, found.problem, found.done) == (False, "", found.total), "only the file is to be written anew"
+    save_untrained(path, seed=0, train={"joint_steps": 7})
+    assert "train.joint_steps is 7 there" in inventory().joint("SpiralMaze", "default", 0).problem

@@ -179,7 +179,7 @@ def test_plain_lines_where_the_output_is_no_terminal() -> None:
     job = Job("evaluate it", "evaluate", RANDOM, (), ("evaluate", "SpiralMaze"), found, wanted=True)
     other = Job(**{**vars(job), "name": "evaluate that"})
     with open("out", "w") as file:
-        view = JobsView(Console(file=file, width=80), [job, other], Forecast([job, other], Timings(Path("t")), "m"))
+        view = JobsView(Console(file=file, width=80), [job, other], Forecast([job, other], Timings(Path("t")), "m"), 2)
         with view:
             view.started(job, Path("log"))
             view.finished(job, 12.0)

@@ -133,7 +133,7 @@ def test_mixed_code_and_mixed_checkpoints_are_named() -> None:
     lines = two.read_text().splitlines(keepends=True)
     two.write_text(lines[0].replace("gabc", "gdef") + "".join(lines[1:]))
     notes = "\n".join(read().notes)
-    assert f"{one} was recorded with uncommitted changes: 0.1.0+g1.dirty." in notes
+    assert f"1 files were recorded, wholly or in part, with uncommitted changes of the code: {one}." in notes
     assert f"{two} holds episodes of 2 versions of the code: 0.1.0+gabc, 0.1.0+gdef." in notes
     shared = "the methods do not share one joint checkpoint: aaaaaaaaaaaa td3bc; bbbbbbbbbbbb mppi."
     assert f"SpiralMaze default seed 0: {shared}" in notes

@@ -55,7 +55,7 @@ class Child:
         log.parent.mkdir(parents=True, exist_ok=True)
         count = str(threads)
         environment = {**os.environ, "OMP_NUM_THREADS": count, "OPENBLAS_NUM_THREADS": count, "MKL_NUM_THREADS": count,
-                       "COLUMNS": "200", "PYTHONUNBUFFERED": "1",
+                       "COLUMNS": "200", "PYTHONUNBUFFERED": "1", "VELAP_LINE_EVERY": "3",
                        "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
         self._began = time.monotonic()
         with log.open("wb") as stream:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from velap.bench.records import Record
     from velap.training.steps import Progress as TrainProgress
 
-LINE_EVERY = 15.0
+LINE_EVERY = float(os.environ.get("VELAP_LINE_EVERY", "15"))
 """Seconds between progress lines where the output is no terminal [s]."""
 
 

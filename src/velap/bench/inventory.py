@@ -32,6 +32,9 @@ Kind = Literal["dataset", "joint", "head", "evaluate"]
 DATASET_SEED = 0
 """Seed of every dataset of the table: training seeds share their data."""
 
+RELEASED = Path("checkpoints")
+"""Where released checkpoints lie, `<task>.safetensors`."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -89,11 +92,11 @@ class Inventory:
 
     def joint(self, task: str, preset: str, seed: int) -> Finding:
         """The joint checkpoint of a run: trained to its end, by the config of today, on the dataset that is there."""
-        config, checkpoint = make_config(task, preset), checkpoint_path(task, preset, seed)
+        config, folder = make_config(task, preset), checkpoint_path(task, preset, seed).parent
         total = config.train.joint_steps + config.train.latent_steps
-        metadata = checkpoint_metadata(checkpoint)
+        metadata = joint_metadata(task, preset, seed)
         if metadata is None:
-            return _unfinished_joint(checkpoint.parent, config, total)
+            return _unfinished_joint(folder, config, total)
         problem = _joint_problem(config, metadata, dataset_provenance(task).get("content_sha256"))
         # Planner and controller are kept with the weights: another one there means to write the file anew, not to train.
         same = not problem and Config.from_json(metadata["config"]) == config
@@ -101,7 +104,7 @@ class Inventory:
 
     def head(self, cell: Cell) -> Finding:
         """The head of a cell: learnt on the latents of the joint checkpoint that is there, with the settings of today."""
-        joint = checkpoint_metadata(checkpoint_path(cell.task, cell.preset, cell.seed))
+        joint = joint_metadata(cell.task, cell.preset, cell.seed)
         path, total = self.head_path(cell), learner_config(cell.method, cell.preset).steps
         head = checkpoint_metadata(path)
         wanted = {"method": cell.method, "head_config": head_settings(cell)}
@@ -151,7 +154,7 @@ class Inventory:
                     "env": get_task(cell.task).env_id, "config_hash": self.expected_hash(cell)}
         joint = None
         if cell.method != "random":
-            joint = checkpoint_metadata(checkpoint_path(cell.task, cell.preset, cell.seed))
+            joint = joint_metadata(cell.task, cell.preset, cell.seed)
         if joint is not None:
             expected["checkpoint"] = joint[WEIGHTS_SHA256]
         for name, value in expected.items():
@@ -185,6 +188,23 @@ def checkpoint_path(task: str, preset: str, seed: int) -> Path:
 def head_settings(cell: Cell) -> str:
     """The settings that the cell's head is trained with today."""
     return learner_config(cell.method, cell.preset).to_json()
+
+
+def released_checkpoint(task: str, preset: str, seed: int) -> Path | None:
+    """The released checkpoint of a task where it is what this run would give and the run has not begun; None otherwise."""
+    path = RELEASED / f"{task}.safetensors"
+    metadata = None if checkpoint_path(task, preset, seed).parent.exists() else checkpoint_metadata(path)
+    if metadata is None or metadata.get("seed") != str(seed):
+        return None
+    config = make_config(task, preset)
+    if _joint_problem(config, metadata, dataset_provenance(task).get("content_sha256")):
+        return None
+    return path if Config.from_json(metadata["config"]) == config else None
+
+
+def joint_metadata(task: str, preset: str, seed: int) -> Mapping[str, str] | None:
+    """Metadata of the run's joint checkpoint, or of the released one that will stand for it; None where there is neither."""
+    return checkpoint_metadata(released_checkpoint(task, preset, seed) or checkpoint_path(task, preset, seed))
 
 
 def dataset_provenance(task: str) -> dict[str, Any]:

@@ -75,20 +75,21 @@ def agreement(jobs: Sequence[Job], forecast: Forecast) -> list[str]:
         return []
     took, expected = (sum(values) for values in zip(*pairs, strict=True))
     within = sum(2 / 3 <= measured / foretold <= 4 / 3 for measured, foretold in pairs)
-    return [f"Measured jobs: {len(pairs)}, which took {duration(took)} where {duration(expected)} were foretold; {within} of "
-            "them are within a third."]
+    return [f"Measured jobs: {len(pairs)}, which took {duration(took)} where {duration(expected)} were foretold; "
+            f"{within} of them are within a third."]
 
 
 class JobsView:
     """Live progress: a bar a running job and one for the whole; plain lines where the output is no terminal."""
 
-    def __init__(self, console: Console, jobs: Sequence[Job], forecast: Forecast) -> None:
+    def __init__(self, console: Console, jobs: Sequence[Job], forecast: Forecast, places: int) -> None:
         self._console = console
+        self._places = places
         self._wanted = [job for job in jobs if job.wanted]
         self._left = {job.name: forecast.left(job) for job in self._wanted}
         self._bars = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                               TextColumn("{task.fields[info]}"), console=console, disable=not console.is_terminal)
-        self._all = self._bars.add_task("jobs", total=len(self._wanted), info="")
+        self._all = self._bars.add_task("jobs", total=len(self._wanted), info=self._time_left())
         self._bar: dict[str, TaskID] = {}
         self._text: dict[str, str] = {}
         self._done = 0
@@ -109,7 +110,7 @@ class JobsView:
         if not self._console.is_terminal and now - self._last_line >= LINE_EVERY:
             self._last_line = now
             running = "; ".join(f"{name}: {words}" for name, words in self._text.items())
-            self._say(f"{self._done} of {len(self._wanted)} jobs done; {running}")
+            self._say(f"{self._done} of {len(self._wanted)} jobs done, {self._time_left()}; {running}")
 
     def finished(self, job: Job, seconds: float) -> None:
         """One more is done."""
@@ -132,7 +133,12 @@ class JobsView:
         self._left.pop(job.name, None)
         if job.name in self._bar:
             self._bars.remove_task(self._bar.pop(job.name))
-        self._bars.update(self._all, completed=self._done, info="")
+        self._bars.update(self._all, completed=self._done, info=self._time_left())
+
+    def _time_left(self) -> str:
+        """Foretold time of the jobs that are not done."""
+        rest = [job for job in self._wanted if job.name in self._left]
+        return f"about {duration(makespan(rest, self._left, self._places))} left"
 
     def _say(self, line: str) -> None:
         self._console.print(line, markup=False, soft_wrap=True)

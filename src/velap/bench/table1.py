@@ -167,13 +167,13 @@ def _comparisons(entries: Sequence[Entry]) -> tuple[Comparison, ...]:
 
 def _mixed_code(entries: Sequence[Entry]) -> list[str]:
     """Files whose episodes come from several versions of the code, or from changes that no commit holds."""
-    notes = []
-    for run in (run for entry in entries for run in entry.runs):
-        versions = run.summary.code_versions
-        if len(versions) > 1:
-            notes.append(f"{run.path} holds episodes of {len(versions)} versions of the code: {', '.join(versions)}.")
-        elif versions[0].endswith(".dirty"):
-            notes.append(f"{run.path} was recorded with uncommitted changes: {versions[0]}.")
+    runs = [run for entry in entries for run in entry.runs]
+    notes = [f"{run.path} holds episodes of {len(run.summary.code_versions)} versions of the code: "
+             f"{', '.join(run.summary.code_versions)}." for run in runs if len(run.summary.code_versions) > 1]
+    dirty = [run for run in runs if any(version.endswith(".dirty") for version in run.summary.code_versions)]
+    if dirty:
+        notes.append(f"{len(dirty)} files were recorded, wholly or in part, with uncommitted changes of the code: "
+                     f"{', '.join(str(run.path) for run in dirty)}.")
     return notes
 
 

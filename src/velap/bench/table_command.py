@@ -16,7 +16,7 @@ from rich.console import Console
 from velap.bench.children import CODE
 from velap.bench.evaluate import code_version
 from velap.bench.forecast import Forecast
-from velap.bench.inventory import Finding, Inventory, checkpoint_path
+from velap.bench.inventory import Finding, Inventory, checkpoint_path, released_checkpoint
 from velap.bench.jobs import Job, Options, make_plan
 from velap.bench.jobs_view import JobsView, plan_table, totals
 from velap.bench.matrix import Selection, everything
@@ -76,8 +76,9 @@ class TableOne:
     def run(self, console: Console) -> None:
         """Run what is missing, then write the table; raises VelapError at the end when a job failed."""
         with _only_one(self.places.logs / "lock"):
+            self._adopt_released()
             jobs, forecast = self._plan(self.selection)
-            with JobsView(console, jobs, forecast) as view:
+            with JobsView(console, jobs, forecast, self.jobs) as view:
                 outcome = self._runner(view).run(Schedule(jobs, {job.name: forecast.left(job) for job in jobs}))
             self.write(console)
         _raise_failures(outcome, len(jobs))
@@ -121,6 +122,13 @@ class TableOne:
         return Runner(lambda job: self._prepare(job, threads), self._look,
                       lambda job, seconds, units: self._record(job, seconds, units, threads), view, self.jobs, threads,
                       self.places.logs, self.code)
+
+    def _adopt_released(self) -> None:
+        """Released checkpoints take the place of joint training: its run directory is where commands look for them."""
+        for task, preset, seed in {(cell.task, cell.preset, cell.seed) for cell in self.selection.cells()}:
+            released = released_checkpoint(task, preset, seed)
+            if released is not None:
+                write_atomic(checkpoint_path(task, preset, seed), released.read_bytes())
 
     def _look(self, job: Job) -> Finding:
         return self._inventory().look(job.kind, job.cell)
