@@ -82,6 +82,22 @@ def test_a_row_does_not_depend_on_the_rows_beside_it():
     assert torch.equal(run(x[5:30]), alone[5:30])
 
 
+@needs_compiler
+@torch.no_grad()
+@pytest.mark.parametrize(("draws", "residual"), [(1, True), (6, True), (3, False)])
+def test_a_rollout_is_its_steps(draws, residual):
+    acting, moving = stirred(MLP(7, (40,), 2, "layer")), stirred(MLP(6, (33, 64), 4, "layer"))
+    z, noise = torch.randn(21, 4), torch.randn(21, draws, 3)
+    run = native.native_rollout(fold(dense_layers(acting)), fold(dense_layers(moving)), residual)
+    expected = z
+    for step in range(6):
+        action = acting(torch.cat([expected, noise[:, min(step, draws - 1)]], -1)).tanh()
+        expected = moving(torch.cat([expected, action], -1)) + residual * expected
+    torch.testing.assert_close(run(z, noise, 6), expected, rtol=1e-4, atol=1e-4)
+    assert torch.equal(run(z, noise, 6)[5:9], run(z[5:9], noise[5:9], 6))
+    assert torch.equal(run(z, noise, 0), z)
+
+
 @torch.no_grad()
 def test_what_native_code_cannot_take_goes_to_torch():
     network = stirred(MLP(6, (16,), 3, "layer"))

@@ -16,8 +16,10 @@ from torch import Tensor, nn
 from velap._version import __version__
 from velap.config import Config, ModelConfig, Precision
 from velap.errors import CheckpointError, VelapError
+from velap.models.folded import dense_layers, fold
 from velap.models.generative import ConditionalVAE
 from velap.models.inference import joined, nearest_row
+from velap.models.native import native_rollout
 from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
 from velap.runs import content_sha256, load_tensors, save_tensors
 
@@ -147,6 +149,7 @@ class LatentModel(nn.Module):
         return {
             **self._fast_functions(hidden),
             "project": self._fast_project() if self.config.bank_size else None,
+            "rollout": self._fast_rollout(),
             "noise_dim": self.config.noise_dim,
             "discount": self.discount,
             "d_neigh": neighbour_distance_factor * step_distance,
@@ -184,6 +187,20 @@ class LatentModel(nn.Module):
             "q": global_q,
             "value": lambda latent: global_q(latent, act_global(latent)),
         }
+
+    def _fast_rollout(self) -> Callable[[Tensor, Tensor | None, int], Tensor] | None:
+        """Simulations by `native.c`, `SearchFns.rollout`; None where it cannot take them."""
+        moving, residual = fold(dense_layers(self.dynamics)), self.config.dynamics_residual
+        by_noise = native_rollout(fold(dense_layers(self.action_model.decoder)), moving, residual)
+        by_policy = native_rollout(fold(dense_layers(self.global_policy)), moving, residual)
+        if by_noise is None or by_policy is None:
+            return None
+
+        def rollout(latent: Tensor, noise: Tensor | None, steps: int) -> Tensor:
+            return by_noise(latent, noise, steps) if noise is not None else by_policy(
+                latent, latent.new_empty(len(latent), 1, 0), steps)
+
+        return rollout
 
     def _fast_project(self) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
         """`project` with the bank's norms computed once."""

@@ -119,47 +119,85 @@ static void activate(const Layer *layer, float *y, long stride, int rows, float 
     }
 }
 
-/* x: `parts` inputs side by side, part p [rows, widths[p]]; out [members, rows, outputs]; layers [members, count];
-   width: the largest padded number of units. */
-void velap_network(const Layer *layers, long members, long count, const float *const *x, const long *widths, long parts,
-                   long rows, long width, float eps, float leak, float *out) {
-    float scratch[2 * ROWS * width];
+/* One network on a block of rows that lie `width` apart in `in`, which it overwrites; gives where the outputs lie, `in` or
+   `next`. */
+static float *network(const Layer *layers, long count, float *in, float *next, long width, int rows, float eps, float leak) {
 #ifdef __AVX512BF16__
     unsigned short halves[ROWS * width];
-#endif
-    for (long start = 0; start < rows; start += ROWS) {
-        const int block = (int)(rows - start < ROWS ? rows - start : ROWS);
-        for (long m = 0; m < members; m++) {
-            float *in = scratch, *next = scratch + ROWS * width;
-            for (int r = 0; r < block; r++) {
-                float *row = in + r * width;
-                for (long p = 0; p < parts; row += widths[p], p++)
-                    memcpy(row, x[p] + (start + r) * widths[p], sizeof(float) * widths[p]);
-            }
-            for (long l = 0; l < count; l++) {
-                const Layer *layer = layers + m * count + l;
-#ifdef __AVX512BF16__
-                for (int r = 0; r < block && layer->halves; r++) halve(in + r * width, layer->inputs, halves + r * width);
 #define PRODUCTS(n) \
     layer->halves ? half_products(layer, halves, width, next, width, n) : products(layer, in, width, next, width, n)
 #else
 #define PRODUCTS(n) products(layer, in, width, next, width, n)
 #endif
-                switch (block) { /* a constant number of rows keeps the sums in registers */
-#define CASE(n) case n: PRODUCTS(n); break;
-                    CASE(1) CASE(2) CASE(3) CASE(4)
-#if ROWS == 8
-                    CASE(5) CASE(6) CASE(7) CASE(8)
+    for (long l = 0; l < count; l++) {
+        const Layer *layer = layers + l;
+#ifdef __AVX512BF16__
+        for (int r = 0; r < rows && layer->halves; r++) halve(in + r * width, layer->inputs, halves + r * width);
 #endif
-                }
-                if (l + 1 < count) activate(layer, next, width, block, eps, leak);
-                float *swap = in;
-                in = next;
-                next = swap;
+        switch (rows) { /* a constant number of rows keeps the sums in registers */
+#define CASE(n) case n: PRODUCTS(n); break;
+            CASE(1) CASE(2) CASE(3) CASE(4)
+#if ROWS == 8
+            CASE(5) CASE(6) CASE(7) CASE(8)
+#endif
+        }
+        if (l + 1 < count) activate(layer, next, width, rows, eps, leak);
+        float *swap = in;
+        in = next;
+        next = swap;
+    }
+    return in;
+}
+
+/* x: `parts` inputs side by side, part p [rows, widths[p]]; out [members, rows, outputs]; layers [members, count];
+   width: the largest padded number of units. */
+void velap_network(const Layer *layers, long members, long count, const float *const *x, const long *widths, long parts,
+                   long rows, long width, float eps, float leak, float *out) {
+    float scratch[2 * ROWS * width];
+    for (long start = 0; start < rows; start += ROWS) {
+        const int block = (int)(rows - start < ROWS ? rows - start : ROWS);
+        for (long m = 0; m < members; m++) {
+            for (int r = 0; r < block; r++) {
+                float *row = scratch + r * width;
+                for (long p = 0; p < parts; row += widths[p], p++)
+                    memcpy(row, x[p] + (start + r) * widths[p], sizeof(float) * widths[p]);
             }
+            const float *y = network(layers + m * count, count, scratch, scratch + ROWS * width, width, block, eps, leak);
             const long outputs = layers[m * count + count - 1].outputs;
             for (int r = 0; r < block; r++)
-                memcpy(out + (m * rows + start + r) * outputs, in + r * width, sizeof(float) * outputs);
+                memcpy(out + (m * rows + start + r) * outputs, y + r * width, sizeof(float) * outputs);
         }
+    }
+}
+
+/* out: z [rows, dim] after `steps` steps. Each takes the action tanh(acting(z, noise[step])) to moving(z, action), plus z
+   where `residual`. noise [rows, draws, noise_dim], the last draw lasting to the end. */
+void velap_rollout(const Layer *acting, long acting_count, const Layer *moving, long moving_count, const float *z,
+                   const float *noise, long draws, long noise_dim, long steps, int residual, long rows, long width, float eps,
+                   float leak, float *out) {
+    const long actions = acting[acting_count - 1].outputs, dim = moving[moving_count - 1].outputs;
+    float scratch[2 * ROWS * width], latents[ROWS * dim];
+    float *const first = scratch, *const second = scratch + ROWS * width;
+    for (long start = 0; start < rows; start += ROWS) {
+        const int block = (int)(rows - start < ROWS ? rows - start : ROWS);
+        memcpy(latents, z + start * dim, sizeof(float) * block * dim);
+        for (long step = 0; step < steps; step++) {
+            const long draw = step < draws ? step : draws - 1;
+            for (int r = 0; r < block; r++) {
+                memcpy(first + r * width, latents + r * dim, sizeof(float) * dim);
+                memcpy(first + r * width + dim, noise + ((start + r) * draws + draw) * noise_dim, sizeof(float) * noise_dim);
+            }
+            const float *acts = network(acting, acting_count, first, second, width, block, eps, leak);
+            float *in = acts == first ? second : first, *next = acts == first ? first : second;
+            for (int r = 0; r < block; r++) {
+                memcpy(in + r * width, latents + r * dim, sizeof(float) * dim);
+                for (long a = 0; a < actions; a++) in[r * width + dim + a] = tanhf(acts[r * width + a]);
+            }
+            const float *change = network(moving, moving_count, in, next, width, block, eps, leak);
+            for (int r = 0; r < block; r++)
+                for (long d = 0; d < dim; d++)
+                    latents[r * dim + d] = change[r * width + d] + (residual ? latents[r * dim + d] : 0);
+        }
+        memcpy(out + start * dim, latents, sizeof(float) * block * dim);
     }
 }

@@ -81,9 +81,26 @@ def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
     number, address = ctypes.c_long, ctypes.c_void_p
     found.velap_network.argtypes = [address, number, number, address, address, number, number, number, ctypes.c_float,
                                     ctypes.c_float, address]
-    found.velap_network.restype = None
+    found.velap_rollout.argtypes = [address, number, address, number, address, address, number, number, number, ctypes.c_int,
+                                    number, number, ctypes.c_float, ctypes.c_float, address]
+    found.velap_network.restype = found.velap_rollout.restype = None
     found.velap_halves.argtypes, found.velap_halves.restype = [], ctypes.c_int
     return found
+
+
+def _library_for(layers: Sequence[Folded], half: bool = False) -> ctypes.CDLL | None:
+    """The library, where it can run these layers."""
+    found = library()
+    wide = max(max(layer.weight.shape[-2:]) for layer in layers) > MOST_UNITS
+    if found is None or wide or (half and not found.velap_halves()):
+        return None
+    plain = all(part.dtype == torch.float32 and part.device.type == "cpu" for layer in layers for part in layer[:2])
+    return found if plain else None
+
+
+def _width(layers: Sequence[Folded]) -> int:
+    """The largest padded number of units."""
+    return max(-(-size // PANEL) * PANEL for layer in layers for size in layer.weight.shape[-2:])
 
 
 def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor], half: bool = False) -> Callable[..., Tensor]:
@@ -94,16 +111,13 @@ def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor], h
     `otherwise` gets what native.c cannot take (other devices and types, more rows than pay) and must give the same. The
     weights are copied.
     """
-    found = library()
-    wide = max(max(layer.weight.shape[-2:]) for layer in layers) > MOST_UNITS
-    if found is None or wide or (half and not found.velap_halves()):
-        return otherwise
-    if any(tensor.dtype != torch.float32 or tensor.device.type != "cpu" for layer in layers for tensor in layer[:2]):
+    found = _library_for(layers, half)
+    if found is None:
         return otherwise
     single = layers[0].weight.dim() == 2
     members = 1 if single else len(layers[0].weight)
     kept, structs = _pack(layers, members, half)
-    width = max(-(-size // PANEL) * PANEL for layer in layers for size in layer.weight.shape[-2:])
+    width = _width(layers)
     outputs, inputs = layers[-1].weight.shape[-1], layers[0].weight.shape[-2]
     run, fixed = found.velap_network, (ctypes.addressof(structs), members, len(layers))
 
@@ -122,6 +136,34 @@ def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor], h
         return out
 
     forward.kept = (kept, structs)  # type: ignore[attr-defined]  # the addresses in the structs are those of these tensors
+    return forward
+
+
+def native_rollout(
+    acting: Sequence[Folded], moving: Sequence[Folded], residual: bool
+) -> Callable[[Tensor, Tensor, int], Tensor] | None:
+    """`z [R, D], noise [R, S, m], steps → z [R, D]` after so many steps with the actions tanh(acting(z, noise)).
+
+    The noise of step i is number min(i, S - 1); `acting` without noise takes m = 0. `moving(z, action)` is the next latent,
+    or with `residual` the change. None where native.c cannot take the layers. The weights are copied.
+    """
+    found = _library_for([*acting, *moving])
+    if found is None:
+        return None
+    kept = [_pack(layers, 1, False) for layers in (acting, moving)]
+    run, width = found.velap_rollout, max(_width(acting), _width(moving))
+    fixed = [number for _, structs in kept for number in (ctypes.addressof(structs), len(structs))]
+
+    def forward(z: Tensor, noise: Tensor, steps: int) -> Tensor:
+        z, noise = z.contiguous(), noise.contiguous()
+        assert z.dtype == noise.dtype == torch.float32
+        assert z.shape[-1] + noise.shape[-1] == acting[0].weight.shape[-2]
+        out = torch.empty_like(z)
+        run(*fixed, z.data_ptr(), noise.data_ptr(), *noise.shape[1:], steps, residual, len(z), width, EPS, LEAK,
+            out.data_ptr())
+        return out
+
+    forward.kept = kept  # type: ignore[attr-defined]  # as above
     return forward
 
 

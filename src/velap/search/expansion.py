@@ -79,13 +79,16 @@ def _simulate_packed(fns: SearchFns, z: Tensor, noise: Tensor, by_policy: Tensor
     split, steps = int(by_policy.sum()), noise.shape[2]
     rows = z.flatten(0, 1).index_select(0, order)
     noise = noise.flatten(0, 1).index_select(0, order[split:])
-    for step in range(n_sim):
+    for step in range(0 if fns.rollout is not None else n_sim):
         actions = []
         if split > 0:
             actions.append(fns.act_global(rows[:split]))
         if split < len(rows):
             actions.append(fns.propose(rows[split:], noise[:, min(step, steps - 1)]))
         rows = fns.step(rows, torch.cat(actions))
+    if fns.rollout is not None:
+        parts = (rows[:split], None), (rows[split:], noise)
+        rows = torch.cat([fns.rollout(part, drawn, n_sim) for part, drawn in parts if len(part)])
     return torch.empty_like(rows).index_copy_(0, order, rows).view_as(z)
 
 
