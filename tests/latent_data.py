@@ -21,8 +21,8 @@ SMALL = ModelConfig(
 def corridor(length: int = 8, copies: int = 40, seed: int = 0) -> LatentData:
     """Walks on the points 0 … length - 1 of a line; entering the last one is rewarded and ends the task.
 
-    An action is +1 (right, coin of 0.5) or -1 (left, or stay at the wall). z = (position / length, 1). So the return of always
-    going right from position p is γ^(length - 2 - p).
+    A coin decides between the actions +1 (right) and -1 (left, or stay at the wall). z = (position / length, 1). So the
+    return of always going right from position p is γ^(length - 2 - p).
     """
     rng = np.random.default_rng(seed)
     rows: list[tuple[float, float, float, bool, int]] = []

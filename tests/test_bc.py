@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from latent_data import SMALL, corridor, joint_checkpoint, noise_store
 from torch import Tensor
 
+from latent_data import SMALL, corridor, joint_checkpoint, noise_store
 from velap.errors import DatasetError
 from velap.models.heads import PolicyHead
 from velap.models.latent import load_checkpoint

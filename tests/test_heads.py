@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-from latent_data import SMALL, joint_checkpoint, metadata_of, noise_store
 
+from latent_data import SMALL, joint_checkpoint, metadata_of, noise_store
 from velap import api, cli
 from velap.errors import CheckpointError, ConfigError, DatasetError, TrainingError, UnknownTaskError
 from velap.models.heads import HEADS, head_path, load_head, make_head, save_head
@@ -235,8 +235,8 @@ def test_the_command_line_trains_a_head_beside_the_joint_checkpoint(
 def test_the_joint_training_comes_first_where_it_is_missing(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("velap.data.episodes.load_store", lambda *args, **kwargs: STORE)
-    quick = ["train.joint_steps=2", "train.latent_steps=2", "train.batch_windows=2", "train.window=5", "train.latent_batch=4",
-             "train.precision=float32", "model.frame_stack=1", "head.steps=2", "train.log_every=1",
+    quick = ["train.joint_steps=2", "train.latent_steps=2", "train.batch_windows=2", "train.window=5",
+             "train.latent_batch=4", "train.precision=float32", "model.frame_stack=1", "head.steps=2", "train.log_every=1",
              "model.encoder_kernels=(4,)", "model.encoder_strides=(4,)", "model.encoder_filters=(4,)"]
     folder = tmp_path / "run"
     assert cli.main(["train", "--dataset", "test", "--out", str(folder), "--method", "iris", "--set", *quick]) == 0

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from latent_data import SMALL, corridor
 
+from latent_data import SMALL, corridor
 from velap.errors import ConfigError
 from velap.models.heads import IQLHead
 from velap.runs import make_generator

@@ -6,8 +6,8 @@ import dataclasses
 
 import pytest
 import torch
-from latent_data import SMALL, corridor
 
+from latent_data import SMALL, corridor
 from velap.errors import ConfigError
 from velap.models.heads import SubgoalHead
 from velap.runs import make_generator
