@@ -184,6 +184,12 @@ def test_a_way_along_each_axis_moves_the_hand_in_the_frame(window: Any) -> None:
     assert away[0] > 4 and abs(away[1]) < abs(right[1])
 
 
+def test_goal_marks_are_not_drawn(env: Any) -> None:
+    """Meta-World's green balls would tell the agent where to go."""
+    red, green, blue = np.moveaxis(env.render().astype(int), -1, 0)
+    assert not ((green > 100) & (red < 60) & (blue < 60)).any()
+
+
 def test_leaving_out_what_is_beside_the_frame_changes_no_pixel(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, rng = SawyerScene(env.model), np.random.default_rng(0)
     left_out = 0
