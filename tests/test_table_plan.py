@@ -179,9 +179,11 @@ def test_a_forecast_takes_the_measured_rate_and_corrects_its_kin(monkeypatch: py
     assert (expect(kin).seconds, expect(kin).source) == (200.0, "scaled"), "twice its calibrated cost, like the measured one"
     assert (expect(other).seconds, expect(other).source) == (100.0, "calibrated"), "another machine says nothing"
     # Left: 300 + 200 (velap, Spiral) + 200 + 100 on two places, the longest first: 300 + 100 beside 200 + 200.
+    # From nothing: 200 + 200 + 400 (td3bc, Spiral) beside all the others.
     lines = jobs_view.totals(plan, expect, "these", 2, 2)
-    assert lines[0] == "8 jobs: 4 done, 4 to run in about 7 min, 2 at once on 2 cores."
-    assert lines[2].startswith("Measured jobs: 1, which took 7 min where 3 min were foretold; 0 of them are within a third")
+    assert lines == [
+        "these: 8 jobs, 4 done, 4 to run in about 7 min; from nothing 13 min. 2 at once on 2 cores.",
+        "Measured jobs: 1, which took 7 min where 3 min were foretold; 0 of them are within a third."]
 
 
 def test_the_whole_table_is_within_its_budget() -> None:
@@ -203,7 +205,8 @@ def test_a_dry_run_says_what_is_there_and_leaves_everything_alone() -> None:
     assert "evaluate SpiralMaze random default seed 0 │ done" in text
     assert "evaluate SpiralMaze td3bc default seed 0 │ 3 of 4 episodes" in text
     assert "outdated: its `config_hash` is 0123456789ab, that of today" in text
-    assert "5 jobs: 1 done, 4 to run in about" in text
+    assert "3 methods × 1 task × 1 preset × 1 training seed: 5 jobs, 1 done, 4 to run in about" in text
+    assert "The paper's table, 9 methods × 6 tasks × 1 preset × 1 training seed, from nothing: " in text
     assert sorted(Path("results").rglob("*")) == before
     assert not Path("docs").exists() and not Path("runs").exists()
 

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from table_cells import fill, inventory
 from velap import cli
+from velap.bench import table_command
 from velap.bench.children import Child
 from velap.bench.inventory import Finding
 from velap.bench.jobs import Job, Options
@@ -194,6 +195,21 @@ def table(code: str | None = None, fresh: bool = False) -> TableOne:
     chosen = parse_only(["task=SpiralMaze", "method=random"])
     extra = {} if code is None else {"code": code}
     return TableOne(chosen, Options(episodes=5), Places(), 2, fresh, **extra)
+
+
+def test_a_second_table_waits_for_the_jobs_of_a_killed_one_and_then_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table_command, "WAIT_SECONDS", 1.5)
+    lock = LOGS / "lock"
+    lock.parent.mkdir(parents=True)
+    console = Console(file=open(os.devnull, "w"))  # noqa: SIM115
+    with table_command._only_one(lock, console) as held:
+        child = Child(["a", "wait"], Path("log"), 1, WORK, (held,))
+    with pytest.raises(VelapError, match="another `velap table 1` is running here"), table_command._only_one(lock, console):
+        pass
+    threading.Timer(0.5, child.stop).start()
+    with table_command._only_one(lock, console):
+        assert child.poll() is not None
+    child.end()
 
 
 DIES = """

@@ -216,7 +216,7 @@ def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make
     from velap.bench.matrix import parse_only
     from velap.bench.table_command import Places, TableOne
 
-    places = Places() if write is None else Places(page=write)
+    places = Places(records.parent) if write is None else Places(records.parent, write)
     one = TableOne(parse_only(only), Options(records, episodes, batch), places, jobs, fresh)
     if dry_run:
         one.dry_run(OUT)

@@ -49,8 +49,9 @@ def follow_parent() -> None:
 class Child:
     """One running command."""
 
-    def __init__(self, command: Sequence[str], log: Path, threads: int, code: str = CODE) -> None:
-        """Start `velap command` with so many threads; what it prints goes to `log`."""
+    def __init__(self, command: Sequence[str], log: Path, threads: int, code: str = CODE,
+                 keep_open: Sequence[int] = ()) -> None:
+        """Start `velap command` with so many threads; what it prints goes to `log`, it holds the descriptors `keep_open`."""
         self.log = log
         log.parent.mkdir(parents=True, exist_ok=True)
         count = str(threads)
@@ -61,7 +62,8 @@ class Child:
         with log.open("wb") as stream:
             # A session of its own: Ctrl-C on the terminal reaches the parent alone, which then stops its children.
             self._process = subprocess.Popen([sys.executable, "-c", code, *command], stdin=subprocess.PIPE, stdout=stream,
-                                             stderr=subprocess.STDOUT, env=environment, start_new_session=True)
+                                             stderr=subprocess.STDOUT, env=environment, pass_fds=tuple(keep_open),
+                                             start_new_session=True)
 
     @property
     def seconds(self) -> float:

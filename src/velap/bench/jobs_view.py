@@ -49,17 +49,22 @@ def plan_table(jobs: Sequence[Job], forecast: Forecast) -> Table:
 
 
 def totals(jobs: Sequence[Job], forecast: Forecast, what: str, places: int, cores: int) -> list[str]:
-    """Lines that sum up a plan: what is left, and the whole of it against the budget."""
+    """Lines that sum up a plan: what is left, the whole of it, and how the measured parts compare with what was foretold."""
     wanted = [job for job in jobs if job.wanted]
     left = makespan(jobs, {job.name: forecast.left(job) for job in jobs}, places)
-    whole = whole_hours(jobs, forecast, places)
     done = sum(job.finding.finished for job in jobs)
     return [
-        f"{len(jobs)} jobs: {done} done, {len(wanted)} to run in about {duration(left)}, {places} at once on {cores} cores.",
-        f"From nothing, {what} take {whole:.1f} h; the budget for 9 methods × 6 tasks × 1 preset × 1 training seed on 2 "
-        f"cores is {BUDGET_HOURS:.0f} h.",
+        f"{what}: {len(jobs)} jobs, {done} done, {len(wanted)} to run in about {duration(left)}; from nothing "
+        f"{duration(3600 * whole_hours(jobs, forecast, places))}. {places} at once on {cores} cores.",
         *agreement(jobs, forecast),
     ]
+
+
+def budget(jobs: Sequence[Job], forecast: Forecast, what: str, places: int, cores: int) -> str:
+    """The whole of the paper's table against its budget."""
+    hours = whole_hours(jobs, forecast, places)
+    return (f"The paper's table, {what}, from nothing: {hours:.1f} h with {places} jobs at once on {cores} cores; budget "
+            f"on 2 cores: {BUDGET_HOURS:.0f} h.")
 
 
 def whole_hours(jobs: Sequence[Job], forecast: Forecast, places: int) -> float:

@@ -75,6 +75,8 @@ class Runner:
     """Folder of what the jobs print."""
     code: str = CODE
     """Python code of a child."""
+    keep_open: tuple[int, ...] = ()
+    """File descriptors that the children hold too."""
 
     def run(self, schedule: Schedule) -> Outcome:
         """Run all jobs of the schedule. Ctrl-C and SIGTERM let the running ones save their state, then raise
@@ -102,7 +104,7 @@ class Runner:
                     continue
                 log = self.logs / f"{re.sub(r'[^A-Za-z0-9]+', '-', job.name)}.log"
                 before = self.look(job).done
-                child = Child(command, log, self.threads, self.code)
+                child = Child(command, log, self.threads, self.code, self.keep_open)
             except (VelapError, OSError) as error:
                 self._fail(job, str(error), schedule, outcome)
                 continue

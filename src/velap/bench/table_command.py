@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -18,8 +19,9 @@ from velap.bench.evaluate import code_version
 from velap.bench.forecast import Forecast
 from velap.bench.inventory import Finding, Inventory, checkpoint_path, released_checkpoint
 from velap.bench.jobs import Job, Options, make_plan
-from velap.bench.jobs_view import JobsView, plan_table, totals
+from velap.bench.jobs_view import JobsView, budget, plan_table, totals
 from velap.bench.matrix import Selection, everything
+from velap.bench.paper import METHODS
 from velap.bench.results_page import results_page
 from velap.bench.runner import Outcome, Runner
 from velap.bench.schedule import Schedule
@@ -29,6 +31,9 @@ from velap.bench.table1_text import markdown_cells, to_csv, to_latex
 from velap.bench.timings import Timing, Timings
 from velap.errors import ConfigError, RecordError, VelapError
 from velap.runs import write_atomic
+
+WAIT_SECONDS = 15.0
+"""Time that jobs of an interrupted table get to end [s]. ours: an update of the joint training or a plan takes a second."""
 
 
 @dataclass(frozen=True)
@@ -70,16 +75,16 @@ class TableOne:
         """Say what is there, what is missing and how long it should take."""
         jobs, forecast = self._plan(self.selection)
         console.print(plan_table(jobs, forecast))
-        for line in self._totals(self.selection):
+        for line in (*self._totals(self.selection), self._budget()):
             console.print(line, markup=False, soft_wrap=True)
 
     def run(self, console: Console) -> None:
         """Run what is missing, then write the table; raises VelapError at the end when a job failed."""
-        with _only_one(self.places.logs / "lock"):
+        with _only_one(self.places.logs / "lock", console) as lock:
             self._adopt_released()
             jobs, forecast = self._plan(self.selection)
             with JobsView(console, jobs, forecast, self.jobs) as view:
-                outcome = self._runner(view).run(Schedule(jobs, {job.name: forecast.left(job) for job in jobs}))
+                outcome = self._runner(view, lock).run(Schedule(jobs, {job.name: forecast.left(job) for job in jobs}))
             self.write(console)
         _raise_failures(outcome, len(jobs))
 
@@ -100,12 +105,18 @@ class TableOne:
         console.print(f"written to {', '.join(map(str, files))}", markup=False, soft_wrap=True)
 
     def _page(self, results: Results) -> str:
-        budget = self._totals(dataclasses.replace(everything(), presets=("default",)))
-        return results_page(results, self._inventory(), self._timings(), self.options, budget)
+        times = (self._budget(), *self._totals(everything()))
+        return results_page(results, self._inventory(), self._timings(), self.options, times)
 
     def _totals(self, selection: Selection) -> list[str]:
         jobs, forecast = self._plan(selection)
         return totals(jobs, forecast, str(selection), self.jobs, self.cores)
+
+    def _budget(self) -> str:
+        """The nine methods of the paper on its tasks, the default preset and one training seed, against the budget."""
+        paper = dataclasses.replace(everything(), methods=METHODS)
+        jobs, forecast = self._plan(paper)
+        return budget(jobs, forecast, str(paper), self.jobs, self.cores)
 
     def _plan(self, selection: Selection) -> tuple[tuple[Job, ...], Forecast]:
         jobs = make_plan(selection.cells(), self._inventory(), self.options)
@@ -117,11 +128,11 @@ class TableOne:
     def _inventory(self) -> Inventory:
         return Inventory(self.options.records, self.options.episodes, self._timings())
 
-    def _runner(self, view: JobsView) -> Runner:
+    def _runner(self, view: JobsView, lock: int) -> Runner:
         threads = max(self.cores // self.jobs, 1)
         return Runner(lambda job: self._prepare(job, threads), self._look,
                       lambda job, seconds, units: self._record(job, seconds, units, threads), view, self.jobs, threads,
-                      self.places.logs, self.code)
+                      self.places.logs, self.code, (lock,))
 
     def _adopt_released(self) -> None:
         """Released checkpoints take the place of joint training: its run directory is where commands look for them."""
@@ -189,13 +200,23 @@ def _move_aside(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def _only_one(path: Path) -> Iterator[None]:
-    """Hold the lock of this table; the kernel releases it however the process ends."""
+def _only_one(path: Path, console: Console) -> Iterator[int]:
+    """Hold the lock of this table and give its descriptor.
+
+    The children hold it as well: those of a killed table save their state before the next one starts, which waits for that.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise VelapError(f"another `velap table 1` is running here (it holds {path}); expected to be alone. Wait for "
-                             "it, or raise its --jobs.") from error
-        yield
+        deadline = time.monotonic() + WAIT_SECONDS
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() > deadline:
+                    raise VelapError(f"another `velap table 1` is running here (it holds {path}); expected to be alone. "
+                                     "Wait for it, or stop it and start this one with more --jobs.") from error
+                if time.monotonic() > deadline - WAIT_SECONDS + 1:
+                    console.print("waiting for the jobs of an interrupted table to save their state", markup=False)
+                time.sleep(1.0)
+        yield lock.fileno()
