@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +19,7 @@ from velap.bench.benchmarks import Measurement, in_turns, peak_memory, synthetic
 from velap.bench.speed import BENCHMARKS, Benchmark, run_benchmarks
 from velap.config import Config, override
 from velap.data.episodes import content_hash, load_store, write_dataset
+from velap.envs.gl import BACKENDS
 from velap.errors import CheckpointError, ConfigError
 from velap.search.shooting import MPPIConfig
 from velap.tasks import make_config
@@ -127,6 +131,29 @@ def test_plan_latency_is_per_environment(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "8 of the 64 environments at once; VELAP 10 expansions of 10 steps; random weights" in result.reference_name
     assert result.value > 0
     assert result.reference_value is not None
+
+
+def test_environment_steps_are_compared_with_metaworlds(monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def slow_world(backend: str) -> Iterator[Callable[[int], float]]:
+        assert backend in BACKENDS
+        yield lambda steps: 7.0 * steps
+
+    monkeypatch.setattr(benchmarks, "meta_world", slow_world)
+    result = benchmarks.sawyer_env_steps_per_s(CPU)
+    assert result.reference_value == pytest.approx(1 / 7)
+    assert result.value > 1
+    assert result.reference_name.startswith("Meta-World's window-close-v3, step + render(64 × 64)")
+
+
+def test_datasets_of_a_benchmark_lie_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    for before in (None, "mine"):
+        monkeypatch.delenv("MINARI_DATASETS_PATH", raising=False)
+        if before is not None:
+            monkeypatch.setenv("MINARI_DATASETS_PATH", before)
+        with benchmarks._datasets_in("elsewhere"):
+            assert os.environ["MINARI_DATASETS_PATH"] == "elsewhere"
+        assert os.environ.get("MINARI_DATASETS_PATH") == before
 
 
 def test_peak_memory_is_this_process_alone() -> None:
