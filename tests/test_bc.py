@@ -82,7 +82,7 @@ def test_bc_learns_a_known_policy(norm: str) -> None:
     data = turning_data()
     torch.manual_seed(0)
     head = PolicyHead(dataclasses.replace(SMALL, norm=norm), 1).train()
-    learner = BCLearner(head, data, BCConfig(steps=400, batch=64, learning_rate=3e-3), make_generator(0))
+    learner = BCLearner(head, data, BCConfig(steps=400, batch=64, learning_rate=3e-3, passes=0), make_generator(0))
     before = learner.report()["held_out/loss"]
     for _ in range(400):
         learner.update()
@@ -122,5 +122,20 @@ def test_success_bc_without_any_success_is_refused(tmp_path: Path) -> None:
         SuccessBCLearner(PolicyHead(SMALL, 3), loaded(tmp_path, successes=0), BCConfig(), make_generator(0))
 
 
+def test_few_transitions_are_passed_over_a_hundred_times_at_most() -> None:
+    data = corridor()
+    n = len(data.training)
+    head = PolicyHead(SMALL, 1)
+
+    def total(**changes: int) -> int:
+        return BCLearner(head, data, BCConfig(**{"steps": 10_000, "batch": 16, **changes}), make_generator(0)).total
+
+    assert total() == -(-100 * n // 16) < 10_000
+    assert total(passes=0) == 10_000
+    assert total(steps=60) == 60
+    assert total(passes=1, batch=256) == 50
+
+
 def test_the_paper_preset_is_appendix_d1() -> None:
-    assert dataclasses.asdict(PAPER_BC) == {"steps": 300_000, "batch": 128, "learning_rate": 3e-4, "cosine": False}
+    assert dataclasses.asdict(PAPER_BC) == {"steps": 300_000, "batch": 128, "learning_rate": 3e-4, "cosine": False,
+                                             "passes": 0}

@@ -178,7 +178,7 @@ def test_latents_are_encoded_once(checkpoint: Path, monkeypatch: pytest.MonkeyPa
 def test_the_joint_preset_chooses_the_learner(tmp_path: Path) -> None:
     checkpoint = joint_checkpoint(tmp_path / "model.safetensors", STORE, preset="paper")
     settings = json.loads(load_tensors(train_head("bc", checkpoint, STORE, steps=2).path)[1]["head_config"])
-    assert settings == {"steps": 2, "batch": 128, "learning_rate": 3e-4, "cosine": False}
+    assert settings == {"steps": 2, "batch": 128, "learning_rate": 3e-4, "cosine": False, "passes": 0}
 
 
 def test_unknown_methods_and_fields_are_named(checkpoint: Path) -> None:
@@ -226,6 +226,9 @@ def test_the_command_line_trains_a_head_beside_the_joint_checkpoint(
     assert "no field ['nothing']" in capsys.readouterr().err
     assert cli.main([*command, "--seed", "4"]) == 2
     assert "task, preset and seed ('test', 'default', 0); expected ('test', 'default', 4)" in capsys.readouterr().err
+    assert cli.main([*command, "train.c1=0.5"]) == 2
+    assert "trained with other values of some of train.c1" in capsys.readouterr().err
+    assert cli.main(["train", "--dataset", "test", "--out", folder, "--method", "mppi"]) == 0, "nothing more to learn"
     assert cli.main(["train", "SpiralMaze", "--method", "random"]) == 2
     assert "`random` has nothing to learn" in capsys.readouterr().err
     assert cli.main(["train", "--dataset", "test", "--out", folder, "--set", "head.steps=3"]) == 2

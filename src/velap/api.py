@@ -102,8 +102,8 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
     store = load_store(dataset_id, image_key, min_length=config.train.dynamics_horizon)
     directory = out or run_dir(task, preset, seed)
     checkpoint = directory / MODEL
-    if learner is not None and checkpoint.exists():
-        _check_origin(checkpoint, task, preset, seed)
+    if method != "velap" and checkpoint.exists():
+        _check_origin(checkpoint, task, preset, seed, changes)
     elif not (resume and _is_finished(checkpoint, config, seed, store.content_hash)):
         run(config, store, directory, seed=seed, device=device, resume=resume, command=command, on_progress=on_progress)
     if learner is not None:
@@ -111,8 +111,8 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
     return checkpoint
 
 
-def _check_origin(checkpoint: Path, task: str, preset: str, seed: int) -> None:
-    """Raises ConfigError unless a joint checkpoint comes from this task, preset and seed."""
+def _check_origin(checkpoint: Path, task: str, preset: str, seed: int, changes: Changes) -> None:
+    """Raises ConfigError unless a joint checkpoint comes from this task, preset and seed and has the fields of `changes`."""
     from velap.models.latent import load_checkpoint
 
     _, config, metadata = load_checkpoint(checkpoint)
@@ -120,6 +120,10 @@ def _check_origin(checkpoint: Path, task: str, preset: str, seed: int) -> None:
     if found != asked:
         raise ConfigError(f"{checkpoint} has task, preset and seed {found}; expected {asked}. Name its own with "
                           "--preset and --seed, or another run directory with --out.")
+    if override(config, **{part: dict(fields) for part, fields in changes.items()}) != config:
+        names = [f"{part}.{name}" for part, fields in changes.items() for name in fields]
+        raise ConfigError(f"{checkpoint} was trained with other values of some of {', '.join(names)}; expected those "
+                          "asked for. Leave them out, or train a joint model with them elsewhere with --out.")
 
 
 def _is_finished(checkpoint: Path, config: Config, seed: int, dataset_hash: str) -> bool:

@@ -159,13 +159,18 @@ class FrozenLearner(ABC, Generic[ConfigT, HeadT]):
         self.optimizers = {"head": self._adam(head)}
         self.pool, self.held_out = data.training, data.held_out
 
+    @property
+    def total(self) -> int:
+        """Updates of the whole training [steps]."""
+        return self.config.steps
+
     @abstractmethod
     def loss(self, rows: Tensor) -> tuple[Tensor, Info]:
         """Loss over transitions `rows` int64 [B], random numbers from `self.generator`."""
 
     def update(self) -> Info:
         """One update on a fresh batch."""
-        self.schedule(self.updates / self.config.steps)
+        self.schedule(self.updates / self.total)
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
         loss, info = self.loss(self.draw())

@@ -78,7 +78,7 @@ class HeadRun:
     @property
     def total(self) -> int:
         """Updates of the whole run [steps]."""
-        return int(self.learner.config.steps)
+        return self.learner.total
 
     @property
     def phase(self) -> str:
