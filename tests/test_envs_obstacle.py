@@ -80,7 +80,7 @@ def test_starts_are_free_and_test_starts_lie_at_the_lower_wall(maze):
 
 
 def test_every_way_leads_round_both_bars(maze):
-    for context in range(0, CONTEXTS, 25):
+    for context in range(0, CONTEXTS, 61):
         layout = obstacle_layout(context)
         starts = layout.test_starts.sample(np.random.default_rng(context), 20)
         steps = layout.geodesic(starts) / STEP_LENGTH

@@ -37,7 +37,7 @@ _ORDER = np.random.default_rng(0).permutation(CONTEXTS)
 
 _GOAL = (27, 57, 37, FRAME)
 """The red piece of the upper wall and of the floor in front of it [px]. Random walks of 20 steps get so far that a wall red
-from end to end would be reached in 0.9 % of the transitions with a strip 0.75 px thin in front of it; it is to be 0.11 %."""
+from end to end would be reached in 0.9 % of the transitions, however thin the strip in front of it; it is to be 0.11 %."""
 _POST = (2, 5)
 """Thickness of the posts on both sides of the red piece, and how far they stand out of the wall [px]: nobody slides into the
 goal along the wall. Between them the block has 5.5 px of freedom, as in SpiralMaze's corridor."""
