@@ -6,6 +6,7 @@ metres.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,23 +31,22 @@ def _metaworld_scene(name: str) -> Any:
 class _NearOrAnywhere(SawyerTask):
     """Data start anywhere above the table, a share of them near the handle; tests start in a box far from it."""
 
-    data_starts: ClassVar[Box]
+    hand_limits = Box((-0.4, 0.4, 0.06), (0.4, 0.8, 0.3))
     test_starts: ClassVar[Box]
     near_share: ClassVar[float]
     """Share of data starts drawn from a box around the handle."""
-    near_box: ClassVar[tuple[float, float, float]]
+    near_box = (0.15, 0.15, 0.12)
     """Half sizes of that box."""
 
+    @abstractmethod
     def handle(self) -> Vector:
         """What the hand has to push, where it has to push it [3] [m]."""
-        raise NotImplementedError
 
     def _sample_start(self, rng: np.random.Generator, split: str) -> Vector:
         if split == "test":
             return self.test_starts.sample(rng)
-        if rng.random() >= self.near_share:
-            return self.data_starts.sample(rng)
-        return self.data_starts.around(self.handle(), self.near_box).sample(rng)
+        near = rng.random() < self.near_share
+        return (self.hand_limits.around(self.handle(), self.near_box) if near else self.hand_limits).sample(rng)
 
     def in_test_region(self, position: Vector | None = None) -> bool:
         """Inside the box of the test starts?"""
@@ -61,14 +61,11 @@ class WindowClose(_NearOrAnywhere):
     """Shove the sash of a window to the left by its handle (C.2.1)."""
 
     assets: ClassVar[str] = "window"
-    hand_limits = Box((-0.4, 0.4, 0.06), (0.4, 0.8, 0.3))
     contexts = Box((-0.08, 0.75, 0.2), (0.08, 0.88, 0.2))
     """Where the window stands."""
-    data_starts = hand_limits
     test_starts = Box((-0.36, 0.42, 0.08), (-0.24, 0.6, 0.22))
     """Left of the window: round the handle and back with it are more than 50 steps."""
     near_share = 0.6
-    near_box = (0.15, 0.15, 0.12)
 
     @classmethod
     def scene(cls) -> Any:
@@ -98,14 +95,11 @@ class FaucetClose(_NearOrAnywhere):
     """Turn the handle of a faucet to the left (C.2.2)."""
 
     assets: ClassVar[str] = "faucet"
-    hand_limits = Box((-0.4, 0.4, 0.06), (0.4, 0.8, 0.3))
     contexts = Box((-0.05, 0.76, 0.0), (0.15, 0.85, 0.0))
     """Where the faucet stands."""
-    data_starts = hand_limits
     test_starts = Box((-0.38, 0.42, 0.08), (-0.3, 0.6, 0.22))
     """Left of the faucet, whose handle is pushed from the right."""
     near_share = 0.4
-    near_box = (0.15, 0.15, 0.12)
 
     @classmethod
     def scene(cls) -> Any:
@@ -156,8 +150,16 @@ class ButtonWall(SawyerTask):
     wall_shift = 0.03
     """The wall's middle is at most so far beside the button: no short cut round either end."""
     wall_ys = (0.49, 0.53)
+    clearance = 0.08
+    """From the middle of the wall to the nearest data starts: the open hand reaches 6 cm along y."""
     front_share = 0.5
     """Share of data starts on the button's side of the wall."""
+    front_half_width = 0.25
+    """They are at most so far beside the button,"""
+    front_y = 0.72
+    """and not further away than this, where the button's face stands."""
+    lee = (0.08, 0.35, 0.4)
+    """Test starts: half width of their box, which is centred on the wall, and its y from and to."""
 
     @classmethod
     def scene(cls) -> Any:
@@ -191,25 +193,21 @@ class ButtonWall(SawyerTask):
         return self.data.body("button").xpos + np.array([0.0, -0.194, 0.0])
 
     def _sample_start(self, rng: np.random.Generator, split: str) -> Vector:
-        wall, limits = self.wall(), self.hand_limits
         if split == "test":
-            low, high = self._test_box()
-        elif rng.random() < self.front_share:
-            x = self.model.body("box").pos[0]
-            low, high = np.array([x - 0.25, wall[1] + 0.08, limits.low[2]]), np.array([x + 0.25, 0.72, limits.high[2]])
-        else:
-            low, high = limits.low, np.array([limits.high[0], wall[1] - 0.08, limits.high[2]])
-        return rng.uniform(low, high)
+            return self._test_starts().sample(rng)
+        y, (low, high) = self.wall()[1], (self.hand_limits.low, self.hand_limits.high)
+        if rng.random() >= self.front_share:
+            return Box(low, (high[0], y - self.clearance, high[2])).sample(rng)
+        x, aside = self.model.body("box").pos[0], self.front_half_width
+        return Box((x - aside, y + self.clearance, low[2]), (x + aside, self.front_y, high[2])).sample(rng)
 
-    def _test_box(self) -> tuple[Vector, Vector]:
-        x = self.model.body("wall").pos[0]
-        return np.array([x - 0.08, 0.35, 0.08]), np.array([x + 0.08, 0.4, 0.15])
+    def _test_starts(self) -> Box:
+        x, (aside, y_from, y_to) = self.model.body("wall").pos[0], self.lee
+        return Box((x - aside, y_from, 0.08), (x + aside, y_to, 0.15))
 
     def in_test_region(self, position: Vector | None = None) -> bool:
         """In the lee of the wall?"""
-        position = self.agent_position() if position is None else position
-        low, high = self._test_box()
-        return bool(((position >= low) & (position <= high)).all())
+        return self._test_starts().contains(self.agent_position() if position is None else position)
 
     def succeeded(self) -> bool:
         """Is the button in?"""
@@ -226,7 +224,7 @@ class ButtonWall(SawyerTask):
         return experts.press_behind_wall(self)
 
 
-class DrawerButton(SawyerTask):
+class DrawerButton(_NearOrAnywhere):
     """Close the drawer, then press the button beside it (C.2.4). Done while the drawer is closed and the button pressed.
 
     Data hold either subtask alone: an open drawer to close, or a closed one and the button to press. Tests start with both
@@ -234,7 +232,6 @@ class DrawerButton(SawyerTask):
     """
 
     assets: ClassVar[str] = "drawer-button"
-    hand_limits = Box((-0.4, 0.4, 0.06), (0.4, 0.8, 0.3))
     drawers = Box((-0.26, 0.86, 0.0), (-0.16, 0.92, 0.0))
     """Where the drawer stands."""
     boxes = Box((0.16, 0.86, 0.115), (0.26, 0.92, 0.115))
@@ -243,7 +240,6 @@ class DrawerButton(SawyerTask):
     drawer_share = 0.5
     """Share of data trajectories that are of the drawer."""
     near_share = 0.3
-    near_box = (0.15, 0.15, 0.12)
 
     def __init__(self, render_mode: str | None = "rgb_array") -> None:
         self._subtask, self._opening = "both", OPEN
@@ -285,22 +281,13 @@ class DrawerButton(SawyerTask):
         """Is the drawer open by at most `CLOSED`?"""
         return bool(self.data.joint("goal_slidey").qpos[0] >= -CLOSED)
 
-    def _goal(self) -> Vector:
-        """What the present subtask is about [3] [m]."""
+    def handle(self) -> Vector:
+        """What the present subtask is about: the drawer's handle or the button [3] [m]."""
         return self.drawer_handle() if self._subtask == "drawer" else self.button()
-
-    def _sample_start(self, rng: np.random.Generator, split: str) -> Vector:
-        if split == "test":
-            return self.test_starts.sample(rng)
-        limits = self.hand_limits
-        if rng.random() >= self.near_share:
-            return limits.sample(rng)
-        return limits.around(self._goal(), self.near_box).sample(rng)
 
     def in_test_region(self, position: Vector | None = None) -> bool:
         """In the box of the test starts, with the drawer open?"""
-        position = self.agent_position() if position is None else position
-        return self.test_starts.contains(position) and not self.drawer_closed()
+        return super().in_test_region(position) and not self.drawer_closed()
 
     def succeeded(self) -> bool:
         """Is the drawer closed and the button in, both now?"""
@@ -308,9 +295,8 @@ class DrawerButton(SawyerTask):
 
     def expert_distance(self) -> float:
         """From the hand to the handle or the button [m]; infinite once a drawer trajectory has closed the drawer."""
-        if self._subtask == "drawer" and self.drawer_closed():
-            return float("inf")
-        return float(np.linalg.norm(self.agent_position() - self._goal()))
+        finished = self._subtask == "drawer" and self.drawer_closed()
+        return float("inf") if finished else super().expert_distance()
 
     def expert_action(self) -> NDArray[np.float32]:
         """The drawer first, then the button."""
