@@ -142,24 +142,24 @@ def exact_values(length: int, expectile: float, discount: float, shift: float) -
 
 
 def test_iql_finds_the_values_and_the_policy_of_a_corridor() -> None:
-    data, expectile, shift = corridor(copies=300), 0.9, -1.0
+    data, expectile, shift = corridor(length=6, copies=200), 0.9, -1.0
     torch.manual_seed(0)
     head = IQLHead(SMALL, 1).train()
-    config = IQLConfig(steps=1200, batch=128, learning_rate=3e-3, target_rate=0.1, cosine=True, expectile=expectile,
+    config = IQLConfig(steps=400, batch=64, learning_rate=1e-2, target_rate=0.2, cosine=True, expectile=expectile,
                        reward_shift=shift, inverse_temperature=1.0, rewarded_share=0.0)
     learner = IQLLearner(head, data, config, make_generator(0))
     for _ in range(config.steps):
         learner.update()
-    v, q = exact_values(8, expectile, data.discount, shift)
-    latents = torch.tensor([[p / 8, 1.0] for p in range(7)])
-    assert v[0] < -4
+    v, q = exact_values(6, expectile, data.discount, shift)
+    latents = torch.tensor([[p / 6, 1.0] for p in range(5)])
+    assert v[0] < -4, "five steps away"
     with torch.no_grad():
-        np.testing.assert_allclose(head.value(latents).numpy(), v, atol=0.3)
+        np.testing.assert_allclose(head.value(latents).numpy(), v, atol=0.2)
         for action, exact in ((-1.0, q[:, 0]), (1.0, q[:, 1])):
-            found = head.qs(latents, torch.full((7, 1), action)).numpy()
-            np.testing.assert_allclose(found, np.broadcast_to(exact, (2, 7)), atol=0.3)
+            found = head.qs(latents, torch.full((5, 1), action)).numpy()
+            np.testing.assert_allclose(found, np.broadcast_to(exact, (2, 5)), atol=0.25)
         # weights of a coin's two actions: Σ w a / Σ w = tanh(β (Q_right - Q_left) / 2)
-        np.testing.assert_allclose(head.act(latents).numpy()[:, 0], np.tanh((q[:, 1] - q[:, 0]) / 2), atol=0.15)
+        np.testing.assert_allclose(head.act(latents).numpy()[:, 0], np.tanh((q[:, 1] - q[:, 0]) / 2), atol=0.2)
 
 
 def test_the_presets_are_appendix_d3_and_the_authors() -> None:
@@ -167,7 +167,8 @@ def test_the_presets_are_appendix_d3_and_the_authors() -> None:
     assert (PAPER_IQL.expectile, PAPER_IQL.inverse_temperature, PAPER_IQL.rewarded_share) == (0.7, 3.0, 0.0)
     for config in (SPARSE_IQL, PAPER_SPARSE_IQL):
         assert (config.expectile, config.inverse_temperature, config.weight_clip) == (0.9, 10.0, 100.0)
-        assert (config.reward_shift, config.target_rate) == (-1.0, 0.005)
+        assert config.reward_shift == -1.0
+    assert (PAPER_IQL.target_rate, PAPER_SPARSE_IQL.target_rate, PAPER_SPARSE_IQL.steps) == (0.005, 0.005, 300_000)
 
 
 @pytest.mark.parametrize(("name", "value"), [

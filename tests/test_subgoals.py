@@ -84,7 +84,7 @@ def test_iris_learns_both_ways_out_and_how_to_go_there() -> None:
     data = walks()
     torch.manual_seed(0)
     head = SubgoalHead(SMALL, 1).train()
-    config = SubgoalConfig(steps=800, batch=128, learning_rate=3e-3, horizon=4, kl_weight=0.03)
+    config = SubgoalConfig(steps=400, batch=64, learning_rate=5e-3, horizon=4, kl_weight=0.03)
     learner = SubgoalLearner(head, data, config, make_generator(0))
     for _ in range(config.steps):
         learner.update()

@@ -22,6 +22,8 @@ from velap.training.losses import Info, action_model_loss, reparameterise
 class SubgoalConfig(LearnerConfig):
     """IRIS. Learning rate, batch and length follow D.1 in `paper`; D.6 gives none."""
 
+    steps: int = 10_000
+    """Updates. ours: see docs/decisions.md; 3·10⁵ in `paper`."""
     horizon: int = 10
     """n, how far ahead a subgoal lies [steps]. D.7: 5 for the multi-step variant. ours: 10 for IRIS, the default of its
     authors' code (robomimic)."""
