@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from velap import api, cli
-from velap.agents.base import METHODS, SETTINGS, Agent, make_agent, method_hash, method_settings
+from velap.agents.base import METHODS, PAPER_SETTINGS, SETTINGS, Agent, make_agent, method_hash, method_settings
 from velap.config import Config, override
 from velap.errors import CheckpointError, ConfigError, UnknownTaskError
 from velap.models.heads import HEADS, AnyHead, SubgoalHead, load_head, make_head, save_head
@@ -194,6 +194,8 @@ def test_the_config_hash_covers_all_that_decides_the_method(checkpoint: Path, me
                                             for other in METHODS if other != method)}
     assert own != method_hash(override(config, planner={"n_iter": 7}), method, head)
     assert own == method_hash(config, method, head, method_settings(method))
+    paper = dataclasses.replace(config, preset="paper")
+    assert method_hash(paper, method, head) == method_hash(paper, method, head, method_settings(method, preset="paper"))
     if method in SETTINGS:
         assert own != method_hash(config, method, head, method_settings(method, QUICK[method]))
     if head is not None:
@@ -249,7 +251,9 @@ def test_a_plan_is_as_long_as_what_is_executed_of_it(checkpoint: Path) -> None:
 
 def test_settings_are_those_of_the_paper() -> None:
     for method in ("mppi", "mbop"):
-        settings = dataclasses.asdict(SETTINGS[method])
+        settings = dataclasses.asdict(PAPER_SETTINGS[method])
+        assert dataclasses.asdict(SETTINGS[method]) == settings | {"goal_ends": True}
+        assert settings["goal_ends"] is False
         counts = [settings[name] for name in ("samples", "horizon", "elites", "iterations", "replan_every")]
         assert counts == [1000, 50, 64, 5, 5]
     assert dataclasses.asdict(SETTINGS["mbop"])["beta"] == 0.7

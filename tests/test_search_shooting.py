@@ -59,6 +59,15 @@ def test_score_is_the_sum_of_q_along_the_way() -> None:
     torch.testing.assert_close(score(toy_fns(), z, actions), torch.tensor(expected, dtype=torch.float64))
 
 
+def test_a_goal_that_ends_keeps_the_highest_value_met() -> None:
+    z = torch.tensor([[[2.0]]], dtype=torch.float64)
+    actions = torch.tensor([[[[1.0], [-2.0], [0.5]], [[-1.0], [0.0], [3.0]]]], dtype=torch.float64)
+    assert score(line(), z, actions).tolist() == [[3.0 + 1.0 + 1.5, 1.0 + 1.0 + 4.0]]
+    assert score(line(), z, actions, goal_ends=True).tolist() == [[3.0 + 3.0 + 3.0, 1.0 + 1.0 + 4.0]]
+    below = torch.tensor([[[-5.0]]], dtype=torch.float64)
+    assert score(line(), below, actions, goal_ends=True).tolist() == [[-4.0 - 4.0 - 4.0, -6.0 - 6.0 - 3.0]]
+
+
 def test_more_iterations_give_better_scores() -> None:
     z_root = torch.tensor([[9.0, -9.0]], dtype=torch.float64)
     first, last = (shoot(toy_fns(), z_root, MPPIConfig(samples=100, horizon=15, elites=10, iterations=n, policy_share=0.0),
@@ -139,13 +148,15 @@ def test_an_iteration_of_mppi_is_that_of_td_mpc() -> None:
 def test_the_mixture_of_mbop_by_hand() -> None:
     plan = torch.tensor([[[0.2], [-0.4]]], dtype=torch.float64)
     noise = torch.tensor([[[[0.1], [0.0]], [[-0.1], [0.3]]]], dtype=torch.float64)
-    actions, scores = mixed_rollouts(line(), torch.zeros(1, 1, 1, dtype=torch.float64), plan, noise, 0.7)
+    actions, scores = mixed_rollouts(line(), torch.zeros(1, 1, 1, dtype=torch.float64), plan, noise, MBOPConfig())
     # 0.3 (0.5 + 0.1) + 0.7 · 0.2 = 0.32; then π^g(0.32) = 0.82: 0.3 · 0.82 - 0.28 = -0.034; Q: 0.32 + 0.286
     # 0.3 (0.5 - 0.1) + 0.7 · 0.2 = 0.26; then π^g(0.26) = 0.76: 0.3 · 1.06 - 0.28 = 0.038; Q: 0.26 + 0.298
     assert actions.flatten().tolist() == pytest.approx([0.32, -0.034, 0.26, 0.038])
     assert scores.flatten().tolist() == pytest.approx([0.606, 0.558])
     again = score(line(), torch.zeros(1, 1, 1, dtype=torch.float64), actions)
     torch.testing.assert_close(scores, again)
+    _, kept = mixed_rollouts(line(), torch.zeros(1, 1, 1, dtype=torch.float64), plan, noise, MBOPConfig(goal_ends=True))
+    assert kept.flatten().tolist() == pytest.approx([0.32 + 0.32, 0.26 + 0.298])
     elites = choose_elites(actions, scores, MBOPConfig(samples=2, elites=2, temperature=2.0))
     first = 1 / (1 + math.exp(-2.0 * 0.048))
     assert elites.mean().flatten().tolist() == pytest.approx(

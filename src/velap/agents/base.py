@@ -31,9 +31,12 @@ METHODS = ("velap", "bc", "bc-success", "td3bc", "iql", "iql-sparse", "mppi", "m
 of its authors, and uniform actions."""
 Settings = MPPIConfig | MBOPConfig | IRISConfig
 SETTINGS: dict[str, Settings] = {
-    "mppi": MPPIConfig(), "mbop": MBOPConfig(), "iris": IRISConfig(), "iris-multistep": MULTISTEP,
+    "mppi": MPPIConfig(goal_ends=True), "mbop": MBOPConfig(goal_ends=True),
+    "iris": IRISConfig(), "iris-multistep": MULTISTEP,
 }
-"""How the planning baselines plan. VELAP's planner is the checkpoint's `planner` and `controller`."""
+"""How the planning baselines plan in the default preset. VELAP's planner is the checkpoint's `planner` and `controller`."""
+PAPER_SETTINGS: dict[str, Settings] = {**SETTINGS, "mppi": MPPIConfig(), "mbop": MBOPConfig()}
+"""The same in the `paper` preset."""
 
 
 class Learnt(Protocol):
@@ -66,10 +69,10 @@ class Agent(Protocol):
         ...
 
 
-def method_settings(method: str, changes: Mapping[str, Any] | None = None) -> Settings | None:
+def method_settings(method: str, changes: Mapping[str, Any] | None = None, preset: str = "default") -> Settings | None:
     """How a method plans, with the fields of `changes` replaced; None for a method that is not in `SETTINGS`."""
     check_method(method)
-    settings = SETTINGS.get(method)
+    settings = (PAPER_SETTINGS if preset == "paper" else SETTINGS).get(method)
     if not changes:
         return settings
     names = [field.name for field in fields(settings)] if settings is not None else []
@@ -83,9 +86,9 @@ def method_hash(config: Config, method: str, head: Learnt | None = None, setting
     """The `config_hash` of a method's records: its joint config, and what else decides how it acts.
 
     Methods that are decided by the joint config alone (velap, td3bc, random) keep that config's hash. `settings` None takes
-    the method's own.
+    those of the config's preset.
     """
-    settings = settings or method_settings(method)
+    settings = settings or method_settings(method, preset=config.preset)
     if settings is None and method not in HEADS:
         return config.hash()
     parts = {"config": config.to_json(), "method": method, "settings": asdict(settings) if settings is not None else {}}
@@ -113,7 +116,7 @@ def make_agent(method: str, model: LatentModel | None, config: Config, action_sp
         config: of the model.
         action_space: the environment's.
         head: what a method in `velap.models.heads.HEADS` learnt beside the model.
-        settings: how a planning baseline plans; None takes `method_settings(method)`.
+        settings: how a planning baseline plans; None takes those of the config's preset.
     """
     from velap.agents.reactive import RandomAgent, ReactiveAgent
     from velap.agents.velap import VelapAgent
@@ -125,6 +128,7 @@ def make_agent(method: str, model: LatentModel | None, config: Config, action_sp
     if model is None:
         raise UnknownTaskError(f"method {method!r} acts by a trained model, got none; name one with --checkpoint.")
     model.eval()
+    settings = settings or method_settings(method, preset=config.preset)
     if method in HEADS:
         return _headed_agent(method, model, stack, head, settings)
     if method == "td3bc":
@@ -133,7 +137,7 @@ def make_agent(method: str, model: LatentModel | None, config: Config, action_sp
         return VelapAgent(model, config)
     from velap.agents.mpc import MPCAgent
 
-    planner: Any = settings or method_settings(method)
+    planner: Any = settings
     return MPCAgent(model, stack, planner)
 
 
@@ -149,7 +153,7 @@ def _headed_agent(method: str, model: LatentModel, stack: int, head: AnyHead | N
     head.eval()
     learnt: Any = head
     if method.startswith("iris"):
-        planner: Any = settings or method_settings(method)
+        planner: Any = settings
         return IRISAgent(method, model, stack, learnt, planner)
     return ReactiveAgent(method, model, learnt.act, stack)
 

@@ -119,8 +119,6 @@ def _load_model(what: Evaluation) -> _Loaded:
     from velap.config import override
     from velap.training.loop import pick_device
 
-    changes = dict(what.changes or {})
-    settings = method_settings(what.method, changes.pop(what.method, None))
     if what.head is not None and what.method not in HEADS:
         raise ConfigError(f"method {what.method!r} learns no head and got {what.head}; expected one of {', '.join(HEADS)}. "
                           "Leave --head out, or name that method.")
@@ -131,6 +129,8 @@ def _load_model(what: Evaluation) -> _Loaded:
                           f"train one with `velap train {what.task}`.")
     device = pick_device(what.device)
     model, config, metadata = load_checkpoint(what.checkpoint, device)
+    changes = dict(what.changes or {})
+    settings = method_settings(what.method, changes.pop(what.method, None), config.preset)
     head = None
     if what.method in HEADS:
         head = load_head(what.head or head_path(what.checkpoint, what.method), metadata, device)
