@@ -22,28 +22,28 @@ BUDGET_HOURS = 24.0
 
 START_SECONDS = 6.0
 """Imports, data and model of a process [s]."""
-ENV_STEP_SECONDS = {"block": 0.0005, "arm": 0.0025}
+ENV_STEP_SECONDS = {"block": 0.0005, "arm": 0.0018}
 """One environment step with its frame [s]."""
 ENCODE_SECONDS = 0.0018
 """Encoding one state and a policy's answer [s]."""
 SOLVED_SAVING = 0.35
 """Share of the time limit that a solved episode leaves unused; how many are solved is read from the paper's table."""
-PLAN_SECONDS = {"mppi": 1.3, "mbop": 0.8, "iris": 0.01, "iris-multistep": 0.02}
+PLAN_SECONDS = {"mppi": 0.7, "mbop": 0.7, "iris": 0.01, "iris-multistep": 0.02}
 """One plan of a method whose cost is the same on every task [s]."""
 PLAN_EVERY = {"mppi": 5, "mbop": 5, "iris": 5, "iris-multistep": 5}
 """Environment steps between two plans [steps], App. D.4 to D.7."""
-ROUND_SECONDS, ROUND_STEP_SECONDS = 0.001, 0.00052
-"""One round of VELAP's search, and each of its simulated steps [s]."""
+EXPANSION_STEP_SECONDS = 0.000012
+"""VELAP's search, one simulated step of one expansion [s]."""
 LOOKAHEAD_SECONDS = 0.0013
 """VELAP's lookahead at each environment step [s]."""
 FRAME_SECONDS = {1: 0.00040, 3: 0.00053}
 """Joint training on whole windows, one encoded state of so many frames with its share of the update [s]."""
 SINGLE_FACTOR = 1.5
 """Joint training where the first transition of a window alone trains the values (`paper`), relative to whole windows."""
-LATENT_UPDATE_SECONDS = 0.08
+LATENT_UPDATE_SECONDS = 0.05
 """One update of the latent phase [s]."""
-HEAD_UPDATE_SECONDS = {"bc": 0.001, "bc-success": 0.001, "iql": 0.004, "iql-sparse": 0.004, "iris": 0.004,
-                       "iris-multistep": 0.004}
+HEAD_UPDATE_SECONDS = {"bc": 0.001, "bc-success": 0.001, "iql": 0.0035, "iql-sparse": 0.0035, "iris": 0.003,
+                       "iris-multistep": 0.003}
 """One update of a learner on frozen latents [s]."""
 
 
@@ -135,7 +135,6 @@ def act_seconds(method: str, config: Config) -> float:
     if method != "velap":
         return ENCODE_SECONDS
     planner, controller = config.planner, config.controller
-    rounds = planner.n_iter / planner.candidates
-    plan = rounds * (ROUND_SECONDS + planner.n_sim * ROUND_STEP_SECONDS)
+    plan = planner.n_iter * planner.n_sim * EXPANSION_STEP_SECONDS
     lookahead = LOOKAHEAD_SECONDS if controller.lookahead else 0.0
     return ENCODE_SECONDS + lookahead + plan / controller.n_replan
