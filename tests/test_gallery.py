@@ -20,12 +20,12 @@ def test_the_picture_shows_start_and_goal_of_every_task(tmp_path: Path, monkeypa
     sheet = np.asarray(Image.open(tmp_path / "docs" / "tasks.png"))
     for column, name in enumerate(names):
         shots = gallery.shoot(get_task(name), 2)
-        left, row = gallery.GAP + column * (256 + gallery.GAP), 256 + gallery.CAPTION
+        left, row = gallery.GAP + column * (256 + gallery.GAP), 256 + gallery.CAPTION + gallery.GAP
         for number, frame in enumerate((shots.start, shots.goal)):
             top = gallery.CAPTION + number * row
             np.testing.assert_array_equal(sheet[top : top + 256 : 4, left : left + 256 : 4], frame)
             np.testing.assert_array_equal(sheet[top + 3 : top + 256 : 4, left + 3 : left + 256 : 4], frame)
-        caption = sheet[2 * row : 2 * row + gallery.CAPTION, left : left + 256]
+        caption = sheet[2 * row - gallery.GAP : 2 * row + gallery.CAPTION - gallery.GAP, left : left + 256]
         assert caption.min() < 100  # there is text
 
 

@@ -21,8 +21,8 @@ from velap.tasks import TASKS, Task
 
 SCALE = 4
 """Enlargement of the frames; a pixel stays a square."""
-GAP = 8
-"""White between the frames [px]."""
+GAP = 10
+"""White between the frames, and below the text under one [px]."""
 CAPTION = 26
 """Height of a line of text [px]."""
 
@@ -53,16 +53,17 @@ def shoot(task: Task, seed: int = 0) -> Shots:
 def side_by_side(shots: Sequence[Shots]) -> Image.Image:
     """A column a task: its name, the start above, the goal state below."""
     side = SCALE * shots[0].start.shape[0]
-    row = side + CAPTION
+    row = side + CAPTION + GAP
     sheet = Image.new("RGB", (len(shots) * (side + GAP) + GAP, CAPTION + 2 * row), "white")
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=17)
     for column, shot in enumerate(shots):
         left = GAP + column * (side + GAP)
-        for number, caption in enumerate((shot.task, "test start", f"goal state, {shot.steps} steps later")):
-            pen.text((left + side / 2, number * row + CAPTION / 2), caption, fill="black", font=font, anchor="mm")
-        for number, frame in enumerate((shot.start, shot.goal)):
+        pen.text((left + side / 2, CAPTION / 2), shot.task, fill="black", font=font, anchor="mm")
+        below = ((shot.start, "test start"), (shot.goal, f"goal state, {shot.steps} steps later"))
+        for top, (frame, caption) in zip((CAPTION, CAPTION + row), below, strict=True):
             large = Image.fromarray(frame).resize((side, side), Image.Resampling.NEAREST)
-            sheet.paste(large, (left, CAPTION + number * row))
+            sheet.paste(large, (left, top))
+            pen.text((left + side / 2, top + side + CAPTION / 2), caption, fill="black", font=font, anchor="mm")
     return sheet
 
 
