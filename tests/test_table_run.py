@@ -62,14 +62,20 @@ def _in_a_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 class Seen:
     """Notes what the runner tells its observer."""
 
-    def __init__(self) -> None:
+    def __init__(self, stop_after: str = "") -> None:
         self.events: list[str] = []
+        self._awaited = set(stop_after)
+        """Names of jobs; SIGTERM once all of them have reported progress."""
 
     def started(self, job: Job, log: Path) -> None:
         self.events.append(f"started {job.name}")
 
     def progress(self, job: Job, done: int, total: int, text: str) -> None:
         self.events.append(f"{job.name} {done}/{total} {text}")
+        if job.name in self._awaited:
+            self._awaited.discard(job.name)
+            if not self._awaited:
+                os.kill(os.getpid(), signal.SIGTERM)
 
     def finished(self, job: Job, seconds: float) -> None:
         self.events.append(f"finished {job.name}")
@@ -126,13 +132,9 @@ def test_a_job_that_ends_well_and_left_nothing_has_failed() -> None:
 
 
 def test_ctrl_c_lets_the_children_save_and_ends_them() -> None:
-    seen, sittings = Seen(), list[tuple[str, int]]()
-    stop = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
-    stop.start()
-    began = time.monotonic()
+    seen, sittings = Seen(stop_after="ab"), list[tuple[str, int]]()
     with pytest.raises(KeyboardInterrupt):
         run([work("a", "wait"), work("b", "wait"), work("c")], seen, sittings=sittings)
-    assert time.monotonic() - began < 10
     assert Path("a.saved").exists() and Path("b.saved").exists() and not Path("c").exists()
     assert "a 1/2 threads 3" in seen.events
     assert sorted(sittings) == [("a", 0), ("b", 0)]
@@ -145,7 +147,7 @@ def test_children_do_not_outlive_a_killed_parent() -> None:
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not Path("log").read_text() and time.monotonic() < deadline:
         time.sleep(0.02)
     parent.kill()
@@ -206,6 +208,7 @@ def test_a_second_table_waits_for_the_jobs_of_a_killed_one_and_then_gives_up(mon
         child = Child(["a", "wait"], Path("log"), 1, WORK, (held,))
     with pytest.raises(VelapError, match="another `velap table 1` is running here"), table_command._only_one(lock, console):
         pass
+    monkeypatch.setattr(table_command, "WAIT_SECONDS", 60.0)
     threading.Timer(0.5, child.stop).start()
     with table_command._only_one(lock, console):
         assert child.poll() is not None
@@ -231,6 +234,7 @@ sys.exit(main())
 """`velap`, killed while the fourth record is being written."""
 
 
+@pytest.mark.timeout(300)  # two starts of the whole package, on whatever else runs
 def test_a_killed_evaluation_loses_one_episode_at_most() -> None:
     quiet = Console(file=open(os.devnull, "w"))  # noqa: SIM115
     path = inventory().record_path(RANDOM)
