@@ -46,7 +46,7 @@ def linear_learner(**changes: object) -> tuple[IQLLearner, dict[str, np.ndarray]
     head = IQLHead(dataclasses.replace(SMALL, policy_dense=(), critic_dense=()), 1)
     config = dataclasses.replace(IQLConfig(batch=4, rewarded_share=0.0), **changes)
     learner = IQLLearner(head, data, config, make_generator(0))
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(7)
     numbers = {"q": rng.normal(size=(2, 3, 1)), "target": rng.normal(size=(2, 3, 1)), "v": rng.normal(size=(1, 2)),
                "pi": rng.normal(size=(1, 2))}
     with torch.no_grad():
@@ -86,6 +86,8 @@ def test_the_losses_are_those_by_hand(changes: dict[str, float]) -> None:
     critics = sum((za @ numbers["q"][i, :, 0] - goal) ** 2 for i in range(2))
     weight = np.minimum(np.exp(config.inverse_temperature * error), config.weight_clip)
     policy = np.tanh(z[:4] @ numbers["pi"][0])
+    assert (error > 0).sum() == 2, "both branches of the expectile"
+    assert (weight == config.weight_clip).sum() == (0 if changes == {} else 2), "the clip is at work"
     loss, info = learner.loss(ROWS)
     assert info["value"].item() == pytest.approx(value.mean(), rel=1e-4)
     assert info["critics"].item() == pytest.approx(critics.mean(), rel=1e-4)
