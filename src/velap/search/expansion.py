@@ -147,6 +147,17 @@ def _reach_where(fns: SearchFns, pairs: _Pairs, z: Tensor, mask: Tensor, incomin
     return q
 
 
+def _value_where(fns: SearchFns, z: Tensor, mask: Tensor) -> Tensor:
+    """Q^g [B, K] of z [B, K, D]; where rows can be picked, -inf outside the mask [B, K]."""
+    if not packs(z):
+        return fns.value(z)
+    values = z.new_full(mask.shape, -torch.inf)
+    chosen = mask.flatten().nonzero().squeeze(1)
+    if len(chosen):
+        values.view(-1).index_copy_(0, chosen, fns.value(z.flatten(0, 1).index_select(0, chosen)).to(values.dtype))
+    return values
+
+
 def first_come(novel: Tensor, blocks: Tensor) -> Tensor:
     """Accepted [B, K] bool: novel [B, K] bool and not blocked by an earlier accepted candidate.
 
@@ -187,7 +198,7 @@ def expand_(tree: Tree, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, 
     gained = _gained_neighbours(fns, pairs, z, accepted, q_in, limits.neighbour)
     tree.neighbour_counts[:, :slots].add_(gained[:, :slots])
     root_steps = tree.root_steps.gather(1, parents) + steps_from_q(q_edge, fns.discount)
-    insert_(tree, Candidates(z, parents, fns.value(z), root_steps, gained[:, slots:]), target)
+    insert_(tree, Candidates(z, parents, _value_where(fns, z, accepted), root_steps, gained[:, slots:]), target)
     return Verdict(accepted, supported, q_edge, std_edge)
 
 
