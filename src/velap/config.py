@@ -203,8 +203,8 @@ class PlannerConfig:
     n_sim: int = 5
     """Simulated steps an expansion [steps], Table 8 (10 in SpiralMaze, ButtonWall, DrawerButton)."""
     candidates: int = 50
-    """K, candidates a round (batch processing, App. B.6). ours: the paper gives no number; 50 plan as well as 25 and in three
-    quarters of the time."""
+    """K, candidates a round (batch processing, App. B.6). ours: the paper gives no number; 50 plan as well as 25 and in
+    three quarters of the time."""
     discard_high_exponent: float = 2.0
     """τ_high = γ^this, Table 8: too close to a node of the tree."""
     discard_low_exponent: float | None = None
