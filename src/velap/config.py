@@ -123,6 +123,13 @@ class TrainConfig:
     """Share of goals from the future of the same trajectory (strategy b). ours."""
     relabel_other: float = 0.4
     """Share of goals from other trajectories (strategy c). ours."""
+    group_windows: int = 1
+    """Windows of a batch that come from episodes recorded near each other, which tend to share a scene; 1 draws all apart.
+    ours: goals of other trajectories (strategy c) then teach what is near within a scene, not only to tell scenes apart."""
+    group_reach: int = 8
+    """Largest distance of the episodes of a group in the recording from its first [episodes]. ours."""
+    group_goals: float = 0.5
+    """Share of the goals of strategy (c) that come from the same group. ours."""
     rewarded_share: float = 0.05
     """Share of windows drawn to hold a rewarded transition, beyond chance. ours; 0 in `paper`."""
     target_rate: float = 0.05
@@ -159,6 +166,8 @@ class TrainConfig:
             "window",
             "dynamics_horizon",
             "policy_every",
+            "group_windows",
+            "group_reach",
             "latent_batch",
             "latent_horizon",
             "log_every",
@@ -171,6 +180,7 @@ class TrainConfig:
         for name in ("c0", "c1", "c2", "c3", "kl_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         _require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
+        _require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
         _require(0 < self.target_rate <= 1, "target_rate", self.target_rate, "a rate in (0, 1]")
         shares = self.relabel_next + self.relabel_future + self.relabel_other
         _require(
@@ -290,8 +300,18 @@ class Config:
     controller: ControllerConfig = field(default_factory=ControllerConfig)
 
     def to_json(self) -> str:
-        """Canonical JSON: sorted keys, so that equal configs are equal text."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+        """Canonical JSON: sorted keys, so that equal configs are equal text.
+
+        Fields younger than the first records are left out at the value that changes nothing: what was recorded before they
+        existed keeps its hash.
+        """
+        raw = dataclasses.asdict(self)
+        for part, names in YOUNGER_FIELDS.items():
+            neutral = type(getattr(self, part))
+            for name in names:
+                if raw[part][name] == getattr(neutral, name):
+                    del raw[part][name]
+        return json.dumps(raw, sort_keys=True)
 
     def hash(self) -> str:
         """First 12 hexadecimal digits of the SHA-256 of `to_json()`."""
@@ -347,6 +367,11 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
     return dataclasses.replace(config, **parts)
 
 
+YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {"train": ("group_windows", "group_reach", "group_goals")}
+"""Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
+
+DEFAULT_TRAIN: dict[str, Any] = {"group_windows": 6}
+"""The default preset beyond the fields' own defaults."""
 PAPER_MODEL: dict[str, Any] = {
     "norm": "batch",
     "dynamics_residual": False,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from velap.config import PAPER_CONTROLLER, PAPER_MODEL, PAPER_PLANNER, PAPER_TRAIN, Config, override
+from velap.config import DEFAULT_TRAIN, PAPER_CONTROLLER, PAPER_MODEL, PAPER_PLANNER, PAPER_TRAIN, Config, override
 from velap.errors import UnknownTaskError
 
 PRESETS = ("default", "paper")
@@ -63,7 +63,7 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "p_value": 0.1,
         "p_policy": 0.1,
         "expansion_weight": 1.0,
-        "anchor": "snap",
+        "anchor": "none",
     },
     "controller": {"n_replan": 15},
 }
@@ -85,7 +85,8 @@ TASKS: dict[str, Task] = {
                 "controller": {"n_replan": 25},
             },
             default_overrides={
-                "train": {"c1": 0.02},
+                # one scene alone: windows drawn together would only be more alike
+                "train": {"c1": 0.02, "group_windows": 1},
                 "planner": {
                     "n_iter": 1000,
                     "discard_low_exponent": 20.0,
@@ -115,7 +116,7 @@ TASKS: dict[str, Task] = {
                     "p_value": 0.1,
                     "p_policy": 0.1,
                     "expansion_weight": 1.0,
-                    "anchor": "snap",
+                    "anchor": "none",
                 },
             },
         ),
@@ -187,6 +188,8 @@ def make_config(task: str, preset: str = "default") -> Config:
     config = Config(task=task, preset=preset)
     if preset == "paper":
         config = override(config, model=PAPER_MODEL, train=PAPER_TRAIN, planner=PAPER_PLANNER, controller=PAPER_CONTROLLER)
+    else:
+        config = override(config, train=DEFAULT_TRAIN)
     if task in TASKS:
         config = override(config, **TASKS[task].overrides)
         if preset == "default":

@@ -28,7 +28,8 @@ def relabel(
 
     (a) the next state, reward 1, end of episode; (b) a later state of the same trajectory; (c) a state of another one.
     (b) starts two steps ahead: one step ahead it is (a), and labelling it 0 would contradict (a). Whenever the drawn goal
-    is the very next frame, the transition counts as (a).
+    is the very next frame, the transition counts as (a). Of the goals (c), the share `group_goals` comes from windows of the
+    same group (ours).
     rows int64 [M]; start int64 [T] positions of z_t; inside bool [T]; valid bool [B, L].
     """
     windows, length = valid.shape
@@ -52,6 +53,12 @@ def relabel(
         future = torch.where(has_future, future, following)
     shift = 1 + uniform(torch.full_like(window, max(windows - 1, 1)))
     elsewhere = (window + shift) % windows
+    if config.group_windows > 1:
+        base = window // config.group_windows * config.group_windows
+        members = (windows - base).clamp(max=config.group_windows)
+        beside = base + (window - base + 1 + uniform(members - 1)) % members
+        near = torch.rand(n, generator=generator, device=device) < config.group_goals
+        elsewhere = torch.where(near & (members > 1), beside, elsewhere)
     other = elsewhere * width + uniform(steps_inside[elsewhere] + 1)
 
     choice = torch.rand(n, generator=generator, device=device)

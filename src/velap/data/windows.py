@@ -63,6 +63,11 @@ class WindowSampler:
         inside = np.arange(len(store.frames)) < store.last
         self.transitions = put(np.flatnonzero(inside & training))
         self.rewarded = put(np.flatnonzero(inside & training & (store.rewards > 0)))
+        kept = np.setdiff1d(np.flatnonzero(store.episode_length), holdout)
+        self.episodes = put(kept)
+        self.starts, self.lengths = put(store.episode_start), put(store.episode_length)
+        # a row's place among the training episodes
+        self.rank_of_row = put(np.searchsorted(kept, store.episode_of).clip(max=max(len(kept) - 1, 0)))
         if len(self.transitions) == 0:
             raise DatasetError("the dataset has no transition to train on; expected episodes of at least one step.")
 
@@ -125,6 +130,8 @@ class WindowSampler:
             return pool[torch.randint(len(pool), (n,), generator=generator, device=self.device)]
 
         anchor = draw(self.transitions, windows)
+        if self.config.group_windows > 1:
+            anchor = self._gather(anchor, generator)
         if self.config.rewarded_share > 0 and len(self.rewarded):
             rare = torch.rand(windows, generator=generator, device=self.device) < self.config.rewarded_share
             anchor = torch.where(rare, draw(self.rewarded, windows), anchor)
@@ -133,3 +140,14 @@ class WindowSampler:
             return first, last, anchor
         back = torch.randint(length, (windows,), generator=generator, device=self.device)
         return first, last, torch.maximum(torch.minimum(anchor - back, last - length), first)
+
+    def _gather(self, anchor: Tensor, generator: torch.Generator) -> Tensor:
+        """Anchors int64 [B] of which each group's first stays and the others move to episodes near its own."""
+        size, reach = self.config.group_windows, self.config.group_reach
+        number = torch.arange(len(anchor), device=self.device)
+        leader = anchor[number // size * size]
+        step = torch.randint(-reach, reach + 1, anchor.shape, generator=generator, device=self.device)
+        episode = self.episodes[(self.rank_of_row[leader] + step).clamp(0, len(self.episodes) - 1)]
+        at = torch.rand(anchor.shape, generator=generator, device=self.device) * self.lengths[episode]
+        moved = self.starts[episode] + at.long().clamp(max=self.lengths[episode] - 1)
+        return torch.where(number % size == 0, anchor, moved)
