@@ -55,7 +55,17 @@ def test_every_field_changes_the_hash() -> None:
     assert len({make_config("SpiralMaze", preset).hash() for preset in PRESETS}) == 2
 
 
+def test_records_older_than_a_field_keep_their_hash() -> None:
+    base = Config("task", "default")
+    assert "group_windows" not in base.to_json()
+    assert override(base, train={"group_windows": 6}).hash() != base.hash()
+    # what results/records/SpiralMaze holds
+    assert make_config("SpiralMaze").hash() == "3894728bad15"
+    assert make_config("SpiralMaze", "paper").hash() == "5f3372247244"
+
+
 @pytest.mark.parametrize(("part", "field", "value"), [
+    (TrainConfig, "group_windows", 0), (TrainConfig, "group_reach", 0), (TrainConfig, "group_goals", 1.5),
     (ModelConfig, "frame_stack", 0), (ModelConfig, "norm", "group"), (ModelConfig, "encoder_filters", (32,)),
     (ModelConfig, "n_ens", 0), (TrainConfig, "discount", 1.0), (TrainConfig, "relabel_next", 0.5),
     (TrainConfig, "learning_rate", 0.0), (TrainConfig, "window", 2), (TrainConfig, "dynamics_loss", "l1"),

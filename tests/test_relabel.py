@@ -109,3 +109,27 @@ def test_held_out_episodes_are_never_drawn():
     draw = WindowSampler(make_store(), TrainConfig(), 1, torch.device("cpu"), np.array([0]))
     batch = draw.sample(200, 4, True, torch.Generator().manual_seed(0))
     assert (batch.rows >= 5).all()
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_groups_of_windows_come_from_episodes_near_each_other_and_share_goals(whole):
+    store = make_store(lengths=(5,) * 40, rewarded=())
+    held = np.array([7, 20])
+    config = TrainConfig(group_windows=6, group_reach=2, group_goals=1.0, rewarded_share=0.0, **shares(other=1.0))
+    draw = WindowSampler(store, config, 1, torch.device("cpu"), held)
+    batch = draw.sample(23, 4, whole, torch.Generator().manual_seed(0))  # three groups of six and one of five
+    episodes = batch.rows[batch.start] // 6
+    group = batch.start // 5 // 6
+    leaders = batch.rows[torch.arange(0, 23, 6) * 5] // 6
+    assert (episodes - leaders[group]).abs().max() <= 3  # two of the training episodes, a held-out one between them
+    assert len(leaders.unique()) > 1 and not torch.isin(episodes, torch.from_numpy(held)).any()
+    goal_group = batch.goals.position // 5 // 6
+    assert torch.equal(goal_group, group)
+    assert not torch.equal(batch.goals.position // 5, batch.start // 5)
+
+
+def test_windows_of_one_group_are_the_windows_of_no_groups():
+    plain, one = (
+        sampler(group_windows=1, group_reach=reach).sample(16, 4, True, torch.Generator().manual_seed(3)) for reach in (1, 8)
+    )
+    assert torch.equal(plain.rows, one.rows) and torch.equal(plain.goals.position, one.goals.position)
