@@ -19,7 +19,7 @@ import numpy as np
 from velap.config import Config, override
 from velap.errors import ConfigError
 from velap.storage import run_dir
-from velap.tasks import TASKS, get_task, make_config
+from velap.tasks import TASKS, get_task, make_config, task_of
 
 if TYPE_CHECKING:
     from velap.agents.base import Agent
@@ -31,13 +31,6 @@ RECORDS = Path("results/records")
 
 Changes = Mapping[str, Mapping[str, Any]]
 """Config fields to replace: `{"train": {"joint_steps": 2000}}`."""
-
-
-def task_of(task_or_dataset: str) -> str:
-    """The task that a dataset id belongs to; the id itself where it is a stranger's."""
-    if task_or_dataset in TASKS:
-        return task_or_dataset
-    return next((task.name for task in TASKS.values() if task.dataset_id == task_or_dataset), task_or_dataset)
 
 
 def config_for(task: str, preset: str, changes: Changes | None) -> Config:

@@ -178,6 +178,13 @@ def get_task(name: str) -> Task:
     return TASKS[name]
 
 
+def task_of(task_or_dataset: str) -> str:
+    """The task that a dataset id belongs to; the id itself where it is a stranger's."""
+    if task_or_dataset in TASKS:
+        return task_or_dataset
+    return next((task.name for task in TASKS.values() if task.dataset_id == task_or_dataset), task_or_dataset)
+
+
 def make_config(task: str, preset: str = "default") -> Config:
     """The config of one task and preset: `paper` is Tables 2-10 and nothing else, `default` what we measured to be best.
 

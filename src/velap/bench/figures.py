@@ -5,6 +5,7 @@ P probed states, D latent dimensions, L waypoints, M nodes of a tree, S frame si
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from sklearn.manifold import Isomap
 from velap.bench.rollout import FrameReader
 from velap.data.episodes import stack_indices
 from velap.models.latent import LatentModel
-from velap.runs import storage_errors
+from velap.runs import write_atomic
 from velap.search.types import Plan
 
 PROBES = 1200
@@ -41,6 +42,8 @@ class LatentMap:
     """[P] Q^g [Q-value]."""
     extent: tuple[float, float, float, float]
     """Left, right, bottom, top of the frame [m]."""
+    frames: NDArray[np.uint8]
+    """[P, S, S, 3] what the agent sees there."""
 
     def locate(self, latents: NDArray[np.float32]) -> NDArray[np.float64]:
         """Positions [*, 2] of the probed states nearest to latents [*, D] [m]."""
@@ -55,13 +58,16 @@ def can_probe(env: gym.Env[Any, Any]) -> bool:
 
 @torch.inference_mode()
 def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_stack: int, rng: np.random.Generator,
-          count: int = PROBES) -> LatentMap:
-    """Encode `count` states at uniform free positions, each after a few steps of one random action, as in the data."""
+          count: int = PROBES, seed: int = 0) -> LatentMap:
+    """Encode `count` states at uniform free positions, each after a few steps of one random action, as in the data.
+
+    `seed` is the environment's: it chooses the scene.
+    """
     world: Any = env.unwrapped
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
     stacks, positions = [], []
-    env.reset(seed=0)
+    env.reset(seed=seed)
     for start in world.free_positions(rng, count):
         world.set_agent_position(start)
         action = rng.uniform(space.low, space.high).astype(space.dtype)
@@ -69,10 +75,12 @@ def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_s
         stacks.append(np.stack([frames[row] for row in stack_indices(np.array(frame_stack - 1), np.array(0), frame_stack)]))
         positions.append(world.agent_position()[:2])
     device = next(model.parameters()).device
-    batches = np.array_split(np.stack(stacks), max(1, count // 256))
+    everything = np.stack(stacks)
+    batches = np.array_split(everything, max(1, count // 256))
     latents = torch.cat([model.encode(torch.from_numpy(batch).to(device)) for batch in batches])
     values = model.value(latents).float().cpu().numpy()
-    return LatentMap(latents.float().cpu().numpy(), np.stack(positions), values, world.extent)
+    return LatentMap(latents.float().cpu().numpy(), np.stack(positions), values, world.extent,
+                     everything[:, -1])
 
 
 def to_pixels(positions: NDArray[np.float64], extent: tuple[float, float, float, float], size: int) -> NDArray[np.float64]:
@@ -93,9 +101,7 @@ def plan_figure(path: Path, frame: NDArray[np.uint8], plan: Plan, row: int, late
         latent_map: where latents are in the world.
         title: above the picture.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
     waypoints = plan.waypoints[row, : plan.length[row]].float().cpu().numpy()
     size = int(plan.tree.size[row])
@@ -104,9 +110,7 @@ def plan_figure(path: Path, frame: NDArray[np.uint8], plan: Plan, row: int, late
     shown = np.clip(latent_map.values, SMALLEST_SHOWN, 1)
     colours = {"c": shown, "norm": LogNorm(SMALLEST_SHOWN, 1), "cmap": "viridis", "s": 14}
 
-    figure = Figure(figsize=(15, 5), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title)
+    figure = new_figure(15, 5, title)
     in_frame, in_latents, in_world = figure.subplots(1, 3)
     _draw_frame(in_frame, frame, latent_map, waypoints)
     _draw_isomap(in_latents, latent_map, nodes, parents, waypoints, colours)
@@ -114,9 +118,25 @@ def plan_figure(path: Path, frame: NDArray[np.uint8], plan: Plan, row: int, late
     in_world.set(title="$Q^g$ over the robot's position", xlabel="x [m]", ylabel="y [m]", aspect="equal",
                  xlim=latent_map.extent[:2], ylim=latent_map.extent[2:])
     figure.colorbar(points, ax=(in_latents, in_world), label="$Q^g$", shrink=0.9)
-    with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
+    save_figure(figure, path)
+
+
+def new_figure(width: float, height: float, title: str) -> Any:
+    """An empty figure of that size [inches] that needs no screen."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    return figure
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """A whole PNG or none; raises StorageError."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=110, format="png")
+    write_atomic(path, content.getvalue())
 
 
 def _draw_frame(axes: Any, frame: NDArray[np.uint8], latent_map: LatentMap, waypoints: NDArray[np.float32]) -> None:

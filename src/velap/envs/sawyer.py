@@ -190,6 +190,10 @@ class SawyerTask(PixelTask):
         """Put an object's joint to rest at a value [m or rad]."""
         self.data.joint(name).qpos, self.data.joint(name).qvel = value, 0.0
 
+    @abstractmethod
+    def objects(self) -> NDArray[np.float64]:
+        """What an episode is about moving: the places of handles and buttons [K, 3] [m]."""
+
     def mocap_position(self) -> Vector:
         """Where the hand is pulled to [3] [m]."""
         return self.data.mocap_pos[0].copy()

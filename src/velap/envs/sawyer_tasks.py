@@ -52,6 +52,10 @@ class _NearOrAnywhere(SawyerTask):
         """Inside the box of the test starts?"""
         return self.test_starts.contains(self.agent_position() if position is None else position)
 
+    def objects(self) -> NDArray[np.float64]:
+        """The handle [1, 3] [m]."""
+        return self.handle()[None]
+
     def expert_distance(self) -> float:
         """From the hand to the handle [m]."""
         return float(np.linalg.norm(self.agent_position() - self.handle()))
@@ -192,6 +196,10 @@ class ButtonWall(SawyerTask):
         """The middle of the button's face [3] [m]."""
         return self.data.body("button").xpos + np.array([0.0, -0.194, 0.0])
 
+    def objects(self) -> NDArray[np.float64]:
+        """The button [1, 3] [m]."""
+        return self.button()[None]
+
     def _sample_start(self, rng: np.random.Generator, split: str) -> Vector:
         if split == "test":
             return self._test_starts().sample(rng)
@@ -281,6 +289,18 @@ class DrawerButton(_NearOrAnywhere):
         """Is the drawer open by at most `CLOSED`?"""
         return bool(self.data.joint("goal_slidey").qpos[0] >= -CLOSED)
 
+    def button_pressed(self) -> bool:
+        """Is the button in?"""
+        return bool(self.data.joint("btnbox_joint").qpos[0] <= -PRESSED)
+
+    def subtasks(self) -> tuple[bool, bool]:
+        """What is done now, in the order that it has to be done: drawer closed, button pressed."""
+        return self.drawer_closed(), self.button_pressed()
+
+    def objects(self) -> NDArray[np.float64]:
+        """The drawer's handle and the button [2, 3] [m]."""
+        return np.stack([self.drawer_handle(), self.button()])
+
     def handle(self) -> Vector:
         """What the present subtask is about: the drawer's handle or the button [3] [m]."""
         return self.drawer_handle() if self._subtask == "drawer" else self.button()
@@ -291,7 +311,7 @@ class DrawerButton(_NearOrAnywhere):
 
     def succeeded(self) -> bool:
         """Is the drawer closed and the button in, both now?"""
-        return self.drawer_closed() and bool(self.data.joint("btnbox_joint").qpos[0] <= -PRESSED)
+        return all(self.subtasks())
 
     def expert_distance(self) -> float:
         """From the hand to the handle or the button [m]; infinite once a drawer trajectory has closed the drawer."""

@@ -5,6 +5,9 @@ Measured on held-out episodes. Letters: F frames, D latent, S starts.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -17,16 +20,29 @@ HORIZONS = (1, 3, 10)
 """Rollout lengths that are reported [steps]."""
 
 
+@dataclass(frozen=True)
+class Horizon:
+    """Every pair of states of held-out episodes that lie `length` steps apart."""
+
+    length: int
+    """k [steps]."""
+    error: Tensor
+    """[S] distance between the k-step prediction of h and the encoded truth [latent distance]."""
+    moved: Tensor
+    """[S] distance between start and truth [latent distance]."""
+    local_steps: Tensor
+    """[S] log_γ Q_min from start to truth [steps]."""
+
+
 @torch.no_grad()
-def diagnose(
-    model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], cache: Tensor | None
-) -> dict[str, float]:
-    """Rollout error and displacement (in one-step lengths), and Q^l in steps, at each horizon over held-out episodes.
+def horizons(
+    model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], lengths: Sequence[int], cache: Tensor | None
+) -> list[Horizon]:
+    """The pairs at each of `lengths` [steps] that some episode is long enough for.
 
     `episodes` are (first row, last row) pairs; `cache` [F, D] holds latents when the encoder is frozen.
-    Keys: `rollout/error_k`, `rollout/moved_k` [one-step lengths], `local/steps_k` [steps], `latent/step` [latent distance].
     """
-    report: dict[str, float] = {}
+    found = []
     with evaluated(model):
         if cache is None:
             rows = torch.cat([torch.arange(first, last + 1) for first, last in episodes]).to(sampler.device)
@@ -35,8 +51,7 @@ def diagnose(
         else:
             rows = torch.arange(len(cache), device=sampler.device)
             latents, offsets = cache, [first for first, _ in episodes]
-        one_step = float("nan")
-        for k in HORIZONS:
+        for k in lengths:
             starts = [
                 torch.arange(o, o + last - first + 1 - k)
                 for o, (first, last) in zip(offsets, episodes, strict=False)
@@ -49,14 +64,29 @@ def diagnose(
             for i in range(k):
                 predicted = model.step(predicted, sampler.actions[rows[start + i]])
             truth = latents[start + k]
-            moved = (truth - latents[start]).norm(dim=-1).mean().item()
-            if k == 1:
-                one_step = moved
-                report["latent/step"] = one_step
-            report[f"rollout/error_{k}"] = (predicted - truth).norm(dim=-1).mean().item() / one_step
-            report[f"rollout/moved_{k}"] = moved / one_step
             q_min, _ = model.reach(latents[start], truth)
-            report[f"local/steps_{k}"] = steps_from_q(q_min, model.discount).median().item()
+            found.append(Horizon(k, (predicted - truth).norm(dim=-1), (truth - latents[start]).norm(dim=-1),
+                                 steps_from_q(q_min, model.discount)))
+    return found
+
+
+def diagnose(
+    model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], cache: Tensor | None
+) -> dict[str, float]:
+    """Rollout error and displacement (in one-step lengths), and Q^l in steps, at each of `HORIZONS`; `horizons` in numbers.
+
+    Keys: `rollout/error_k`, `rollout/moved_k` [one-step lengths], `local/steps_k` [steps], `latent/step` [latent distance].
+    """
+    report: dict[str, float] = {}
+    one_step = float("nan")
+    for horizon in horizons(model, sampler, episodes, HORIZONS, cache):
+        moved = horizon.moved.mean().item()
+        if horizon.length == 1:
+            one_step = moved
+            report["latent/step"] = one_step
+        report[f"rollout/error_{horizon.length}"] = horizon.error.mean().item() / one_step
+        report[f"rollout/moved_{horizon.length}"] = moved / one_step
+        report[f"local/steps_{horizon.length}"] = horizon.local_steps.median().item()
     return report
 
 
