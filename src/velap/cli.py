@@ -265,6 +265,29 @@ def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device =
     run_benchmarks(OUT, json, device, only)
 
 
+def diagnose(task: Positional[str | None] = None, checkpoint: Path | None = None, dataset: str | None = None,
+             out: Path | None = None, episodes: int = 10, first_seed: int = 1000, env: str | None = None,
+             image_key: str | None = None, max_steps: int | None = None, device: Device = "auto",
+             settings: Settings = ()) -> None:
+    """Look into a trained model and its plans, and at where its episodes fail; writes pictures and a page of text.
+
+    Args:
+        task: Task name; leave it out with --dataset.
+        checkpoint: `model.safetensors` of a run; the task's released one unless said.
+        dataset: Minari dataset that the model is compared with; the task's own unless said.
+        out: Folder of the report; runs/diagnosis/TASK unless said.
+        episodes: Episodes that are run and judged.
+        first_seed: Seed of the first one; seeds 0 to 99 are the test episodes and refused.
+        env: Any Gymnasium id instead of the task's own.
+        image_key: Key of the image in dict observations.
+        max_steps: Time limit where the environment has none.
+    """
+    from velap.bench.diagnose import Request, run_diagnose
+
+    run_diagnose(OUT, Request(task, checkpoint, dataset, out, episodes, first_seed, device, parse_settings(settings), env,
+                              image_key, max_steps, _command()))
+
+
 def study(subject: Annotated[Positional[Literal["faults", "experts"]],
                              arg(help="`faults`: kills, damage, full disks. `experts`: can the tasks be solved.")],
           quick: bool = False, seed: int = 0, write: Path | None = None, json: Path | None = None) -> None:
@@ -316,7 +339,7 @@ def info() -> None:
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": demo, "collect": collect, "train": train, "evaluate": evaluate, "run": run, "table": table, "bench": bench,
-    "study": study, "figure": figure, "info": info,
+    "diagnose": diagnose, "study": study, "figure": figure, "info": info,
 }
 
 

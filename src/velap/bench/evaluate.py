@@ -70,12 +70,17 @@ class Player:
         """A rollout over `batch` new environments."""
         envs = make_envs(self.make_env, batch)
         spec = envs[0].spec
-        options = {"split": "test"} if spec is not None and spec.namespace == "velap" else None
         limit = spec.max_episode_steps if spec is not None else None
         if limit is None and self.max_steps is None:
             raise ConfigError(f"the environment {self.key.env} has no time limit; give one with --max-steps.")
         reader = FrameReader(envs[0], self.image_size, self.image_key)
-        return Rollout(envs, self.agent, reader, reset_options=options, max_steps=self.max_steps, observer=observer)
+        return Rollout(envs, self.agent, reader, reset_options=reset_options(envs[0]), max_steps=self.max_steps,
+                       observer=observer)
+
+
+def reset_options(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
+    """What makes an environment of ours start as in evaluation; nothing for others."""
+    return {"split": "test"} if env.spec is not None and env.spec.namespace == "velap" else None
 
 
 def load_player(what: Evaluation) -> Player:
