@@ -10,25 +10,16 @@ import pytest
 import torch
 from rich.console import Console
 
-from toy_env import SIDE, ToyEnv, ToyModel, toy_config, toy_env
+from toy_env import SIDE, ToyModel, toy_env, toy_player
 from toy_world import GOAL, misleading_value
-from velap.agents.base import make_agent
 from velap.bench import demo
 from velap.bench.evaluate import Player
 from velap.bench.figures import LatentMap, can_probe, plan_figure, probe, to_pixels
-from velap.bench.records import RunKey
 from velap.bench.rollout import FrameReader
 from velap.bench.video import CAPTION, HOLD, TILE, VideoRecorder, film
 from velap.errors import CheckpointError, StorageError
 from velap.search.est import plan
 from velap.search.types import SearchFns
-
-
-def toy_player(max_steps: int = 60, n_iter: int = 300) -> Player:
-    model, config = ToyModel(), toy_config(n_iter=n_iter)
-    key = RunKey("toy", "velap", "default", 0, "toy-v0", "0" * 12, "", "test")
-    agent = make_agent("velap", model, config, ToyEnv().action_space)  # type: ignore[arg-type]
-    return Player(agent, model, config, key, toy_env, SIDE, None, max_steps)  # type: ignore[arg-type]
 
 
 def test_positions_and_pixels_agree() -> None:

@@ -13,6 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from toy_world import GOAL, HALF_WIDTH, START, TIP, crosses_wall, move, straight_to_goal, toy_fns
+from velap.agents.base import make_agent
+from velap.bench.evaluate import Player
+from velap.bench.records import RunKey
 from velap.config import Config, override
 
 SIDE = 8
@@ -113,6 +116,14 @@ def toy_config(**planner: object) -> Config:
 def toy_env() -> gym.Env[Any, Any]:
     """The environment with a time limit of 60 steps."""
     return gym.wrappers.TimeLimit(ToyEnv(), 60)
+
+
+def toy_player(max_steps: int = 60, n_iter: int = 300) -> Player:
+    """VELAP in the toy world."""
+    model, config = ToyModel(), toy_config(n_iter=n_iter)
+    key = RunKey("toy", "velap", "default", 0, "toy-v0", "0" * 12, "", "test")
+    agent = make_agent("velap", model, config, ToyEnv().action_space)  # type: ignore[arg-type]
+    return Player(agent, model, config, key, toy_env, SIDE, None, max_steps)  # type: ignore[arg-type]
 
 
 gym.register("Toy-v0", ToyEnv, max_episode_steps=60)

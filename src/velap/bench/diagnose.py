@@ -125,6 +125,8 @@ def resolve(request: Request) -> _Subject:
         task = task_of(request.dataset)
     if request.dataset is None:
         get_task(task)
+    if env is not None or task in TASKS:
+        _check_seeds(request, task in TASKS and env is None)
     checkpoint = request.checkpoint
     if checkpoint is None:
         if task not in TASKS:
@@ -137,7 +139,6 @@ def resolve(request: Request) -> _Subject:
                            f"episodes. Make it with `velap collect {task}`, or name another one with --dataset.")
     evaluation = None
     if env is not None or task in TASKS:
-        _check_seeds(request, task in TASKS and env is None)
         changes = dict(request.changes or {})
         evaluation = Evaluation(task, "velap", checkpoint, env=env, image_key=request.image_key,
                                 max_steps=request.max_steps, device=request.device, changes=changes)
@@ -192,7 +193,7 @@ def _measure(console: Console, request: Request, subject: _Subject, model: Laten
     failures = None
     if player is not None:
         with console.status(f"{request.episodes} episodes at once"):
-            failures = watch(player, range(request.first_seed, request.first_seed + request.episodes))
+            failures = watch(player, range(request.first_seed, request.first_seed + request.episodes), recorded.fastest)
     pictures = ["model.png", *(["values.png"] if curves else []), *(["scenes.png"] if world.scenes else []), "plan.png"]
     return Diagnosis(
         subject.name, request.command, _origin(subject, recorded, config), _left_out(world, player),

@@ -30,7 +30,7 @@ SHOTS = 20
 CLASSES = {
     "solved": "success within the time limit",
     "never left the start": "the agent was never farther from its start than "
-                            f"{LEFT_START:.0f} of the longest steps that these episodes show",
+                            f"{LEFT_START:.0f} of the longest steps that the data or these episodes show",
     "wrong order": "a later subtask was done while an earlier one was not",
     "object not finished": f"an object was moved by more than {100 * TOUCHED:.0f} cm, and no success: lost, or pushed the "
                            "wrong way",
@@ -109,7 +109,7 @@ class Failures:
 
 
 def classify(trace: Trace, fastest: float) -> str:
-    """The class of an episode; `fastest` is the longest step that was seen [m/step]."""
+    """The class of an episode; `fastest` is the longest step that is known [m/step]."""
     if trace.success:
         return "solved"
     if trace.positions and _farthest(trace) <= LEFT_START * fastest:
@@ -140,9 +140,9 @@ def fastest_step(traces: Sequence[Trace]) -> float:
     return float(np.concatenate(ways).max()) if ways else 0.0
 
 
-def judge(traces: Sequence[Trace]) -> tuple[Outcome, ...]:
-    """Every episode, in the order of the seeds."""
-    fastest = fastest_step(traces)
+def judge(traces: Sequence[Trace], fastest: float | None) -> tuple[Outcome, ...]:
+    """Every episode, in the order of the seeds; `fastest` is the longest recorded step, where it is known [m/step]."""
+    fastest = max(fastest_step(traces), fastest or 0.0)
     return tuple(Outcome(
         trace.seed, classify(trace, fastest), trace.steps, _farthest(trace) if trace.positions else None,
         max(trace.values, default=float("nan")), float(np.mean(trace.near_goal)) if trace.near_goal else 0.0,
@@ -183,17 +183,17 @@ def failure_strip(trace: Trace, kind: str) -> Strip:
     for number in picked:
         step, frame = trace.shots[number]
         frames.append(frame)
-        value = f"$Q^g$ {trace.values[step]:.3f}" if step < len(trace.values) else "end"
+        value = f"$Q^g$ {trace.values[step]:.2g}" if step < len(trace.values) else "end"
         by_global = ", $\\pi^g$" if step < len(trace.near_goal) and trace.near_goal[step] else ""
         captions.append(f"step {step}\n{value}{by_global}")
     return Strip(f"Episode {trace.seed}: {kind}", np.stack(frames), tuple(captions))
 
 
-def watch(player: Player, seeds: Sequence[int]) -> Failures:
-    """Run the episodes and judge each."""
+def watch(player: Player, seeds: Sequence[int], fastest: float | None) -> Failures:
+    """Run the episodes and judge each by the longest recorded step [m/step]."""
     tracer = Tracer(every=5)
     for _ in player.rollout(min(BATCH, len(seeds)), tracer).run(seeds):
         pass
-    outcomes = judge(list(tracer.traces.values()))
+    outcomes = judge(list(tracer.traces.values()), fastest)
     shown = max(outcomes, key=lambda outcome: (outcome.kind != "solved", outcome.steps))
     return Failures(outcomes, failure_strip(tracer.traces[shown.seed], shown.kind))

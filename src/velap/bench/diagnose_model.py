@@ -63,6 +63,15 @@ class Recorded:
         """Rows of those episodes, one after the other."""
         return np.concatenate([np.arange(first, last + 1) for first, last in self.spans])
 
+    @property
+    def fastest(self) -> float | None:
+        """The agent's way in its fastest recorded steps [m/step]; None where positions are unknown."""
+        if self.positions is None:
+            return None
+        moving = self.sampler.transitions.cpu().numpy()
+        ways = np.linalg.norm(self.positions[moving + 1].astype(np.float64) - self.positions[moving], axis=-1)
+        return float(np.quantile(ways, 0.999))
+
 
 def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, config: Config,
                   metadata: Mapping[str, str]) -> Recorded:
@@ -181,11 +190,10 @@ def local_steps(model: LatentModel, start: Tensor, goal: Tensor) -> NDArray[np.f
 
 def _least_steps(recorded: Recorded, start: NDArray[np.int64], goal: NDArray[np.int64]) -> NDArray[np.float64] | None:
     """Distance of the agent's positions by the fastest of its recorded steps [steps]."""
-    if recorded.positions is None:
+    places, fastest = recorded.positions, recorded.fastest
+    if places is None or not fastest:
         return None
-    places, moving = recorded.positions.astype(np.float64), recorded.sampler.transitions.cpu().numpy()
-    fastest = np.quantile(np.linalg.norm(places[moving + 1] - places[moving], axis=-1), 0.999)
-    return np.linalg.norm(places[goal] - places[start], axis=-1) / max(float(fastest), 1e-9)
+    return np.linalg.norm(places[goal].astype(np.float64) - places[start], axis=-1) / fastest
 
 
 @dataclass(frozen=True)

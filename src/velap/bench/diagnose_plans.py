@@ -112,8 +112,8 @@ def plan_strip(starts: Starts, result: Plan, album: Album, one_step: float, row:
     frames, distances = album.nearest(result.waypoints[row, :length])
     frames = frames.copy()
     frames[0] = starts.stacks[row, -1]
-    captions = [f"start\n$Q^g$ {values[0]:.3f}"]
-    captions += [f"{number}: {distance / one_step:.1f} off\n$Q^g$ {value:.3f}"
+    captions = [f"start\n$Q^g$ {values[0]:.2g}"]
+    captions += [f"{number}: {distance / one_step:.1f} off\n$Q^g$ {value:.2g}"
                  for number, (distance, value) in enumerate(zip(distances[1:], values[1:], strict=True), 1)]
     return Strip(f"Plan from {starts.labels[row]}: nearest frames of {album.source} and how far off they are "
                  "[one-step lengths]", frames, tuple(captions))

@@ -148,8 +148,8 @@ def _of_trees(trees: Trees, discount: float) -> Iterator[Finding]:
             "Tree nodes against their own scene", f"nodes from {numbers[0].start} are {trees.scene_distance:.2f} one-step "
             f"lengths from the nearest real state of that scene, its real states {trees.scene_spacing:.2f} from each other",
             trees.scene_distance <= max(SUPPORT_FACTOR * trees.scene_spacing, 1.0),
-            f"at most a step, or {SUPPORT_FACTOR} times as far as real states", "the tree drifts into other scenes or out of "
-            "all: more contexts in the data, fewer planner.n_sim, shorter edges (planner.discard_low_exponent)")
+            f"at most a step, or {SUPPORT_FACTOR} times as far as real states", "the tree drifts into other scenes or out "
+            "of all: more contexts in the data, fewer planner.n_sim, shorter edges (planner.discard_low_exponent)")
 
 
 def _tree_advice(numbers: Sequence[TreeNumbers]) -> str:

@@ -91,8 +91,8 @@ def load_player(what: Evaluation) -> Player:
     loaded = _load_model(what)
     model, config = loaded.model, loaded.config
     if what.env is None and config.task != what.task:
-        raise ConfigError(f"{what.checkpoint} was trained on {config.task!r}, not on {what.task!r}; evaluate it with "
-                          f"`velap evaluate {config.task}`, or name an environment with --env.")
+        raise ConfigError(f"{what.checkpoint} was trained on {config.task!r}, not on {what.task!r}; expected "
+                          f"the same. Name the task {config.task!r}, or an environment with --env.")
     env = make_env(env_id)
     try:
         agent = make_agent(what.method, model, config, _checked_actions(env, model), loaded.head, loaded.settings)
