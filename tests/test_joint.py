@@ -172,6 +172,25 @@ def test_latent_phase_leaves_the_encoder_alone(tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(before, run.model.encoder.parameters(), strict=True))
 
 
+def test_the_joint_learning_rate_falls_only_when_asked(tmp_path):
+    for anneal, expected in ((False, [1.0] * 4), (True, [1.0, 0.855, 0.505, 0.155])):
+        run = trainer(tmp_path / str(anneal), joint_steps=4, anneal=anneal)
+        rates = []
+        for _ in expected:
+            run.update()
+            rates.append({group["lr"] for optimizer in run.learner.optimizers.values() for group in optimizer.param_groups})
+        assert [next(iter(rate)) / QUICK.learning_rate for rate in rates] == pytest.approx(expected, abs=1e-3)
+        assert all(len(rate) == 1 for rate in rates)
+
+
+def test_an_annealed_run_cannot_be_resumed_with_another_length(tmp_path):
+    run = trainer(tmp_path, joint_steps=4, anneal=True)
+    run.update()
+    run.save()
+    with pytest.raises(CheckpointError, match="another config"):
+        trainer(tmp_path, joint_steps=8, anneal=True).resume()
+
+
 @pytest.mark.parametrize("norm", ["layer", "batch"])
 @pytest.mark.parametrize("stop", [2, 6, 10])
 def test_resume_goes_on_to_the_same_bits(tmp_path, norm, stop):

@@ -99,6 +99,8 @@ class TrainConfig:
     """Rollouts of h a batch of whole windows, their starts drawn at random; 0 starts one wherever k steps are left. ours."""
     learning_rate: float = 3e-4
     """Table 7, Adam."""
+    anneal: bool = False
+    """The joint phase's learning rate falls along a cosine to a hundredth of `learning_rate`. ours; off in `paper`."""
     c0: float = 0.2
     """Weight of the global critic's loss, Eq. 2, Table 7."""
     c1: float = 0.01
@@ -367,7 +369,9 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
     return dataclasses.replace(config, **parts)
 
 
-YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {"train": ("group_windows", "group_reach", "group_goals")}
+YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
+    "train": ("group_windows", "group_reach", "group_goals", "anneal"),
+}
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 
 DEFAULT_TRAIN: dict[str, Any] = {"group_windows": 6}

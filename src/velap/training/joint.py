@@ -157,7 +157,7 @@ class JointLearner:
         self._optimise(self.config.latent_learning_rate, encoder=False)
 
     def set_learning_rate(self, learning_rate: float) -> None:
-        """For the schedule of the latent phase."""
+        """For the schedule of a phase."""
         for optimizer in self.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate

@@ -107,6 +107,8 @@ class Trainer:
         """One update of the current phase."""
         train = self.config.train
         if self.step < train.joint_steps:
+            if train.anneal:
+                self.learner.set_learning_rate(train.learning_rate * cosine(self.step / train.joint_steps))
             info = self.learner.joint_step()
         else:
             if self.learner.cache is None:
@@ -138,11 +140,12 @@ class Trainer:
     def _identity(self) -> dict[str, str]:
         """What must agree for a resume: everything that has had an effect on training so far.
 
-        Planner and controller never have. How long the joint phase lasts and what the latent phase does count once the
-        latent phase has begun (`schedule`).
+        Planner and controller never have. How long the joint phase lasts (where its learning rate does not depend on it) and
+        what the latent phase does count once the latent phase has begun (`schedule`).
         """
         train = asdict(self.config.train)
-        schedule = {name: train.pop(name) for name in sorted(train) if name == "joint_steps" or name.startswith("latent_")}
+        late = () if self.config.train.anneal else ("joint_steps",)
+        schedule = {name: train.pop(name) for name in sorted(train) if name in late or name.startswith("latent_")}
         learned = {"task": self.config.task, "model": asdict(self.config.model), "train": train}
         return {
             "config": json.dumps(learned, sort_keys=True),
