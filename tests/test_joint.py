@@ -183,6 +183,15 @@ def test_the_joint_learning_rate_falls_only_when_asked(tmp_path):
         assert all(len(rate) == 1 for rate in rates)
 
 
+def test_runs_older_than_a_field_can_be_resumed(tmp_path):
+    run = trainer(tmp_path)
+    run.update()
+    run.save()
+    _, metadata = load_tensors(tmp_path / STATE)
+    assert "anneal" not in metadata["config"] and "group_windows" not in metadata["config"]
+    trainer(tmp_path).resume()
+
+
 def test_an_annealed_run_cannot_be_resumed_with_another_length(tmp_path):
     run = trainer(tmp_path, joint_steps=4, anneal=True)
     run.update()

@@ -308,11 +308,8 @@ class Config:
         existed keeps its hash.
         """
         raw = dataclasses.asdict(self)
-        for part, names in YOUNGER_FIELDS.items():
-            neutral = type(getattr(self, part))
-            for name in names:
-                if raw[part][name] == getattr(neutral, name):
-                    del raw[part][name]
+        for part in YOUNGER_FIELDS:
+            raw[part] = older_fields(part, raw[part])
         return json.dumps(raw, sort_keys=True)
 
     def hash(self) -> str:
@@ -373,6 +370,14 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
     "train": ("group_windows", "group_reach", "group_goals", "anneal"),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
+
+def older_fields(part: str, values: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a part without those of `YOUNGER_FIELDS` that have their defaults."""
+    defaults = {f.name: f.default for f in dataclasses.fields(get_type_hints(Config)[part])}
+    return {
+        name: value for name, value in values.items() if name not in YOUNGER_FIELDS[part] or value != defaults[name]
+    }
+
 
 DEFAULT_TRAIN: dict[str, Any] = {"group_windows": 6}
 """The default preset beyond the fields' own defaults."""

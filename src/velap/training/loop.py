@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from velap.config import Config
+from velap.config import Config, older_fields
 from velap.data.episodes import FrameStore
 from velap.data.windows import WindowSampler
 from velap.errors import CheckpointError, ConfigError, DatasetError
@@ -143,7 +143,7 @@ class Trainer:
         Planner and controller never have. How long the joint phase lasts (where its learning rate does not depend on it) and
         what the latent phase does count once the latent phase has begun (`schedule`).
         """
-        train = asdict(self.config.train)
+        train = older_fields("train", asdict(self.config.train))
         late = () if self.config.train.anneal else ("joint_steps",)
         schedule = {name: train.pop(name) for name in sorted(train) if name in late or name.startswith("latent_")}
         learned = {"task": self.config.task, "model": asdict(self.config.model), "train": train}
