@@ -32,7 +32,7 @@ def test_what_is_ours_is_off_in_the_paper_preset() -> None:
     assert (model.dynamics_residual, model.critic_bounded, model.bank_size, model.latent_norm) == (False, False, 0, False)
     assert config.train.latent_steps == 0
     assert not config.train.whole_windows
-    assert (config.train.group_windows, config.train.anneal) == (1, False)
+    assert (config.train.group_windows, config.train.anneal, config.train.reconstruction) == (1, False, 0)
     assert not config.planner.coherent_noise
     assert config.planner.anchor == "none"
 

@@ -45,6 +45,9 @@ QUICK = TrainConfig(
 )
 
 
+FRAMES = torch.zeros(1, 2, 16, 16, 3, dtype=torch.uint8)
+
+
 def make_store(episodes: int = 12, length: int = 6) -> FrameStore:
     rng = np.random.default_rng(0)
     n = episodes * (length + 1)
@@ -183,6 +186,26 @@ def test_the_joint_learning_rate_falls_only_when_asked(tmp_path):
         assert all(len(rate) == 1 for rate in rates)
 
 
+def test_the_decoder_teaches_the_encoder_and_is_not_part_of_the_model(tmp_path):
+    plain, taught = trainer(tmp_path / "plain"), trainer(tmp_path / "taught", reconstruction=1.0)
+    for a, b in zip(plain.model.parameters(), taught.model.parameters(), strict=True):
+        assert torch.equal(a, b), "the decoder must not touch the model's first weights"
+    assert "reconstruction/loss" in taught.update() and "reconstruction/loss" not in plain.update()
+    assert not torch.equal(plain.model.encoder(FRAMES), taught.model.encoder(FRAMES))
+    assert plain.model.state_dict().keys() == taught.model.state_dict().keys()
+    decoder = taught.learner.decoder
+    stacks = taught.sampler.stacks(torch.arange(5))
+    assert decoder.shrink(stacks).shape == (5, 3 * 16 * 16)
+    newest = stacks[:, -1].permute(0, 3, 1, 2).flatten(1).float() / 255  # frames of 16 x 16 are what they are shrunk to
+    assert torch.allclose(decoder.shrink(stacks), newest)
+
+
+def test_a_decoded_scene_is_learnt(tmp_path):
+    run = trainer(tmp_path, reconstruction=1.0, joint_steps=60, learning_rate=1e-2)
+    losses = [float(run.update()["reconstruction/loss"]) for _ in range(60)]
+    assert np.mean(losses[-5:]) < np.mean(losses[:5])
+
+
 def test_runs_older_than_a_field_can_be_resumed(tmp_path):
     run = trainer(tmp_path)
     run.update()
@@ -203,14 +226,14 @@ def test_an_annealed_run_cannot_be_resumed_with_another_length(tmp_path):
 @pytest.mark.parametrize("norm", ["layer", "batch"])
 @pytest.mark.parametrize("stop", [2, 6, 10])
 def test_resume_goes_on_to_the_same_bits(tmp_path, norm, stop):
-    straight = trainer(tmp_path / "a", norm)
-    broken = trainer(tmp_path / "b", norm)
+    straight = trainer(tmp_path / "a", norm, reconstruction=0.5)
+    broken = trainer(tmp_path / "b", norm, reconstruction=0.5)
     for _ in range(12):
         straight.update()
     for _ in range(stop):
         broken.update()
     broken.save()
-    again = trainer(tmp_path / "b", norm)
+    again = trainer(tmp_path / "b", norm, reconstruction=0.5)
     again.resume()
     for _ in range(12 - stop):
         again.update()

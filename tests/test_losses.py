@@ -12,6 +12,7 @@ from velap.training.losses import (
     infonce_loss,
     policy_loss,
     polyak,
+    reconstruction_loss,
     reparameterise,
     rollout_mse_loss,
     td_target,
@@ -110,3 +111,13 @@ def test_polyak_moves_by_its_rate():
     target = [tensor([0.0])]
     polyak(target, [tensor([2.0])], 0.25)
     assert target[0].item() == 0.5
+
+
+def test_reconstruction_is_one_for_the_mean_frame():
+    frames = torch.tensor([[0.2, 0.8], [0.6, 0.4]])
+    mean, deviation = torch.tensor([0.4, 0.6]), torch.tensor(0.2)
+    loss, info = reconstruction_loss(torch.zeros(2, 2), frames, mean, deviation)
+    assert loss.item() == pytest.approx(1.0) and info["loss"].item() == pytest.approx(1.0)
+    exact = torch.tensor([[-1.0, 1.0], [1.0, -1.0]])
+    assert reconstruction_loss(exact, frames, mean, deviation)[0].item() == pytest.approx(0.0, abs=1e-12)
+    assert reconstruction_loss(exact + 2, frames, mean, deviation)[0].item() == pytest.approx(4.0)

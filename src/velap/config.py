@@ -105,6 +105,9 @@ class TrainConfig:
     """Weight of the global critic's loss, Eq. 2, Table 7."""
     c1: float = 0.01
     """Weight of the dynamics loss, Eq. 2, Table 7 (0.001 in SpiralMaze)."""
+    reconstruction: float = 0.0
+    """Weight of the reconstruction loss of the joint phase; 0 has none. ours: Eq. 2 asks the latent only for what a step or
+    a value depends on here and now, and far parts of a scene may go missing; the paper does without."""
     c2: float = 0.001
     """Weight of imitation in the local policy, Eq. 5, Table 7."""
     c3: float = 0.001
@@ -179,7 +182,7 @@ class TrainConfig:
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("learning_rate", "latent_learning_rate", "temperature"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        for name in ("c0", "c1", "c2", "c3", "kl_weight"):
+        for name in ("c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         _require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
         _require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
@@ -367,7 +370,7 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "train": ("group_windows", "group_reach", "group_goals", "anneal"),
+    "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction"),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 

@@ -155,7 +155,7 @@ class FrozenLearner(ABC, Generic[ConfigT, HeadT]):
         self.model, self.data, self.config, self.generator = head, data, config, generator
         self.cache: Tensor | None = data.latents
         self.updates = 0
-        self.targets: dict[str, nn.Module] = {}
+        self.companions: dict[str, nn.Module] = {}
         self.optimizers = {"head": self._adam(head)}
         self.pool, self.held_out = data.training, data.held_out
 

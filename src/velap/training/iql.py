@@ -82,7 +82,7 @@ class IQLLearner(FrozenLearner[IQLConfig, IQLHead]):
     def __init__(self, head: IQLHead, data: LatentData, config: IQLConfig, generator: torch.Generator) -> None:
         super().__init__(head, data, config, generator)
         self.target = copy.deepcopy(head.critics).requires_grad_(False).eval()
-        self.targets = {"critics": self.target}
+        self.companions = {"critics": self.target}
         self.optimizers = {"values": self._adam(head.critics, head.value_net), "policy": self._adam(head.policy)}
         self._pairs = (
             list(self.target.parameters()), list(head.critics.parameters()),

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from velap.config import TrainConfig
 from velap.data.windows import Batch, WindowSampler
 from velap.models.latent import LatentModel
+from velap.models.networks import MLP
 from velap.threads import one_thread
 from velap.training.losses import (
     Info,
@@ -26,6 +27,7 @@ from velap.training.losses import (
     infonce_loss,
     policy_loss,
     polyak,
+    reconstruction_loss,
     reparameterise,
     rollout_mse_loss,
     td_target,
@@ -64,6 +66,37 @@ def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple
     return torch.stack(predicted), torch.stack(truth), torch.stack(valid)
 
 
+class FrameDecoder(MLP):
+    """Latents → the newest frame of the stack, shrunk (ours). It learns beside the encoder and is thrown away."""
+
+    SIDE = 16
+    """Side of the shrunk frames [px]."""
+    FRAMES = 160
+    """Frames a batch that are decoded: more cost more than they teach."""
+
+    def __init__(self, model: LatentModel, sampler: WindowSampler, generator: torch.Generator) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(generator.initial_seed())
+            super().__init__(model.config.latent_dim, (256,), 3 * self.SIDE**2, "layer")
+        self.to(sampler.device)
+        step = max(len(sampler.frames) // 2048, 1)
+        sample = self.shrink(sampler.stacks(torch.arange(0, len(sampler.frames), step, device=sampler.device)))
+        self.mean = sample.mean(0)
+        """float32 [C], mean frame of the data."""
+        self.deviation = (sample - self.mean).square().mean().sqrt().clamp(min=1e-3)
+        """float32 [], of the data from it."""
+
+    def shrink(self, stacks: Tensor) -> Tensor:
+        """uint8 [M, N, H, W, 3] → the newest frames, float32 [M, 3 · SIDE²] in [0, 1]."""
+        newest = stacks[:, -1].permute(0, 3, 1, 2).float() / 255
+        return nn.functional.adaptive_avg_pool2d(newest, self.SIDE).flatten(1)
+
+    def loss(self, latents: Tensor, stacks: Tensor, generator: torch.Generator) -> tuple[Tensor, Info]:
+        """Reconstruction loss of some of the frames. latents [M, D]; stacks uint8 [M, N, H, W, 3]."""
+        chosen = torch.randperm(len(latents), generator=generator, device=latents.device)[: self.FRAMES]
+        return reconstruction_loss(self(latents[chosen]), self.shrink(stacks[chosen]), self.mean, self.deviation)
+
+
 class JointLearner:
     """Owns the model, its target critics and the optimisers; `joint_step` and `latent_step` are single updates."""
 
@@ -71,10 +104,12 @@ class JointLearner:
         self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
         self.local_target = copy.deepcopy(model.local_critics).requires_grad_(False).eval()
         self.global_target = copy.deepcopy(model.global_critic).requires_grad_(False).eval()
+        self.decoder = FrameDecoder(model, sampler, generator) if config.reconstruction > 0 else None
         self.cache: Tensor | None = None
         self.updates = 0
         self._optimise(config.learning_rate, encoder=True)
-        targets, sources = self.targets.values(), (model.local_critics, model.global_critic)
+        targets = (self.local_target, self.global_target)
+        sources = (model.local_critics, model.global_critic)
         self._target_pairs = (
             [p for m in targets for p in m.parameters()],
             [p for m in sources for p in m.parameters()],
@@ -83,9 +118,10 @@ class JointLearner:
         )
 
     @property
-    def targets(self) -> dict[str, nn.Module]:
-        """Target critics by name."""
-        return {"local": self.local_target, "global": self.global_target}
+    def companions(self) -> dict[str, nn.Module]:
+        """Target critics by name, and the decoder."""
+        decoder = {"decoder": self.decoder} if self.decoder is not None else {}
+        return {"local": self.local_target, "global": self.global_target, **decoder}
 
     @property
     def optimizers(self) -> dict[str, torch.optim.Optimizer]:
@@ -96,6 +132,7 @@ class JointLearner:
         """Fresh optimisers; the encoder is left out in the latent phase."""
         model = self.model
         parts: list[nn.Module] = [model.encoder] if encoder else []
+        parts += [self.decoder] if encoder and self.decoder is not None else []
         parts += [model.dynamics, model.local_critics, model.global_critic]
         self.model_parameters = [p for part in parts for p in part.parameters()]
         acting: list[nn.Module] = [model.local_policy, model.global_policy, model.action_model]
@@ -108,7 +145,8 @@ class JointLearner:
         config = self.config
         batch = self.sampler.sample(config.batch_windows, config.window, config.whole_windows, self.generator)
         self.model_optimizer.zero_grad(set_to_none=True)
-        encoded = self.model.encode(self.sampler.stacks(batch.rows))
+        stacks = self.sampler.stacks(batch.rows)
+        encoded = self.model.encode(stacks)
         latents = (
             encoded.detach().requires_grad_()
         )  # the heads' gradient is gathered here and goes to the encoder in one piece
@@ -120,7 +158,11 @@ class JointLearner:
             else:
                 dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, torch.ones((), device=latents.device))
             values, more = self.value_loss(latents, batch)
-            (config.c1 * dynamics + values).backward()
+            loss = config.c1 * dynamics + values
+            if self.decoder is not None:
+                reconstruction, pixels = self.decoder.loss(latents, stacks, self.generator)
+                loss, more = loss + config.reconstruction * reconstruction, {**more, "reconstruction/loss": pixels["loss"]}
+            loss.backward()
         encoded.backward(latents.grad)
         with self._threads(batch):
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch)}

@@ -90,3 +90,12 @@ def reparameterise(mean: Tensor, log_variance: Tensor, noise: Tensor) -> Tensor:
 def polyak(targets: Sequence[Tensor], sources: Sequence[Tensor], rate: float) -> None:
     """targets ← (1 - rate) · targets + rate · sources, in place."""
     torch._foreach_lerp_(list(targets), list(sources), rate)
+
+
+def reconstruction_loss(decoded: Tensor, frames: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Info]:
+    """Mean-squared error of the decoded frames in deviations of the data, ours: 1 is what the mean frame would have.
+
+    decoded [M, C]; frames [M, C] shrunk frames in [0, 1]; mean [C]; deviation [], root mean square over frames and places.
+    """
+    loss = (decoded - (frames - mean) / deviation).square().mean()
+    return loss, {"loss": loss.detach()}

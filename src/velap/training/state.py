@@ -32,8 +32,8 @@ class Learner(Protocol):
         ...
 
     @property
-    def targets(self) -> Mapping[str, nn.Module]:
-        """Target networks by name."""
+    def companions(self) -> Mapping[str, nn.Module]:
+        """Networks beside the model by name: targets, and what is thrown away after training."""
         ...
 
     @property
@@ -49,7 +49,7 @@ class Learner(Protocol):
 def save_state(path: Path, learner: Learner, metadata: Mapping[str, str]) -> None:
     """Write everything that a resume to the same bits needs, atomically."""
     tensors = {f"model/{name}": value for name, value in learner.model.state_dict().items()}
-    for name, module in learner.targets.items():
+    for name, module in learner.companions.items():
         tensors |= {f"target/{name}/{key}": value for key, value in module.state_dict().items()}
     for name, optimizer in learner.optimizers.items():
         for index, moments in optimizer.state_dict()["state"].items():
@@ -73,7 +73,7 @@ def load_state(path: Path, learner: Learner, identity: Mapping[str, str]) -> dic
     learner.model.load_state_dict(_under("model/", tensors))
     if metadata["latent_phase"] == "1":
         learner.begin_latent_phase()
-    for name, module in learner.targets.items():
+    for name, module in learner.companions.items():
         module.load_state_dict(_under(f"target/{name}/", tensors))
     for name, optimizer in learner.optimizers.items():
         _restore(optimizer, _under(f"optimizer/{name}/", tensors))
