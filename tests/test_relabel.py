@@ -44,7 +44,7 @@ def shares(next_=0.0, future=0.0, other=0.0) -> dict:
 
 
 def episode_of(rows: torch.Tensor) -> torch.Tensor:
-    return torch.bucketize(rows, torch.tensor([5, 12, 18]), right=True)
+    return torch.bucketize(rows.contiguous(), torch.tensor([5, 12, 18]), right=True)
 
 
 @pytest.mark.parametrize("whole", [True, False])
