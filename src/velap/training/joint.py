@@ -23,6 +23,7 @@ from velap.threads import one_thread
 from velap.training.losses import (
     Info,
     action_model_loss,
+    constancy_loss,
     critic_loss,
     infonce_loss,
     policy_loss,
@@ -162,10 +163,20 @@ class JointLearner:
             if self.decoder is not None:
                 reconstruction, pixels = self.decoder.loss(latents, stacks, self.generator)
                 loss, more = loss + config.reconstruction * reconstruction, {**more, "reconstruction/loss": pixels["loss"]}
+            if config.constancy > 0 and self.model.config.static_dim:
+                constancy, parts = self._constancy(latents, batch)
+                loss, more = loss + config.constancy * constancy, {**more, "constancy/loss": parts["loss"]}
             loss.backward()
         encoded.backward(latents.grad)
         with self._threads(batch):
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch)}
+
+    def _constancy(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
+        """Constancy loss of the batch's windows. latents [M, D]."""
+        windows, length = batch.valid.shape
+        static = latents[: windows * (length + 1), -self.model.config.static_dim :]
+        inside = nn.functional.pad(batch.valid, (1, 0), value=True)
+        return constancy_loss(static.view(windows, length + 1, -1), inside)
 
     def latent_step(self) -> Info:
         """One update on cached latents: the dynamics by rollout error, the other heads as before (when `latent_heads`)."""

@@ -99,3 +99,18 @@ def reconstruction_loss(decoded: Tensor, frames: Tensor, mean: Tensor, deviation
     """
     loss = (decoded - (frames - mean) / deviation).square().mean()
     return loss, {"loss": loss.detach()}
+
+
+def constancy_loss(static: Tensor, inside: Tensor) -> tuple[Tensor, Info]:
+    """Variance within windows as a share of all variance, ours: 0 where nothing changes along a window, 1 where windows are alike.
+
+    static [B, F, S], the dimensions that should stay, of each window's frames; inside bool [B, F], frames of the episode.
+    """
+    counted = inside.unsqueeze(-1).float()
+    n = counted.sum(1, keepdim=True).clamp(min=1)
+    centre = (static * counted).sum(1, keepdim=True) / n
+    mean = (static * counted).sum((0, 1)) / counted.sum().clamp(min=1)
+    within = ((static - centre).square() * counted).sum()
+    total = ((static - mean).square() * counted).sum()
+    loss = within / total.clamp(min=1e-6)
+    return loss, {"loss": loss.detach()}
