@@ -8,6 +8,7 @@ from torch import tensor
 
 from velap.training.losses import (
     action_model_loss,
+    constancy_loss,
     critic_loss,
     infonce_loss,
     policy_loss,
@@ -121,3 +122,14 @@ def test_reconstruction_is_one_for_the_mean_frame():
     exact = torch.tensor([[-1.0, 1.0], [1.0, -1.0]])
     assert reconstruction_loss(exact, frames, mean, deviation)[0].item() == pytest.approx(0.0, abs=1e-12)
     assert reconstruction_loss(exact + 2, frames, mean, deviation)[0].item() == pytest.approx(4.0)
+
+
+def test_constancy_is_the_share_of_the_variance_within_windows():
+    static = torch.tensor([[[0.0], [2.0], [50.0]], [[4.0], [6.0], [5.0]]])
+    inside = torch.tensor([[True, True, False], [True, True, False]])
+    loss, info = constancy_loss(static, inside)
+    assert loss.item() == pytest.approx(4 / 20), "means 1 and 5, of all 3: (1 + 1 + 1 + 1) / (9 + 1 + 1 + 9)"
+    assert info["loss"].item() == pytest.approx(4 / 20)
+    assert constancy_loss(static[:, :1].expand(2, 3, 1), inside)[0].item() == pytest.approx(0.0)
+    assert constancy_loss(static[:1].expand(2, 3, 1), inside)[0].item() == pytest.approx(1.0)
+    assert torch.isfinite(constancy_loss(torch.zeros(2, 3, 1), inside)[0])
