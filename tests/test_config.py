@@ -69,7 +69,8 @@ def test_records_older_than_a_field_keep_their_hash() -> None:
 @pytest.mark.parametrize(("part", "field", "value"), [
     (TrainConfig, "group_windows", 0), (TrainConfig, "group_reach", 0), (TrainConfig, "group_goals", 1.5),
     (ModelConfig, "frame_stack", 0), (ModelConfig, "norm", "group"), (ModelConfig, "encoder_filters", (32,)),
-    (ModelConfig, "n_ens", 0), (ModelConfig, "static_dim", 32), (TrainConfig, "constancy", -1.0), (TrainConfig, "discount", 1.0), (TrainConfig, "relabel_next", 0.5),
+    (ModelConfig, "n_ens", 0), (ModelConfig, "static_dim", 32), (TrainConfig, "constancy", -1.0),
+    (TrainConfig, "discount", 1.0), (TrainConfig, "relabel_next", 0.5),
     (TrainConfig, "learning_rate", 0.0), (TrainConfig, "window", 2), (TrainConfig, "dynamics_loss", "l1"),
     (PlannerConfig, "n_iter", 0), (PlannerConfig, "p_sparse", 0.9), (PlannerConfig, "temperature_value", 0.0),
     (PlannerConfig, "anchor", "glue"), (ControllerConfig, "n_replan", 0),

@@ -297,6 +297,8 @@ class ControllerConfig:
     by π^l alone [steps]. ours: π^l pushes into walls at corners that h knows of; 0 in `paper`."""
     lookahead_samples: int = 32
     """Actions drawn from g for the lookahead. ours."""
+    scene_memory: bool = False
+    """The `static_dim` dimensions of a state are averaged over the episode so far. ours; off in `paper`."""
 
     def __post_init__(self) -> None:
         _require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")
@@ -383,6 +385,7 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
     "model": ("static_dim",),
     "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction", "constancy"),
+    "controller": ("scene_memory",),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 

@@ -23,6 +23,31 @@ if TYPE_CHECKING:
     from velap.models.latent import LatentModel
 
 
+class SceneMemory:
+    """The static dimensions of a latent, averaged over the episode so far (ours): one frame tells the scene less exactly."""
+
+    def __init__(self, static_dim: int) -> None:
+        self.static_dim = static_dim
+        """S, last dimensions of a latent that are averaged; 0 leaves all as they are."""
+        self._sum = torch.empty(0, 0)
+        self._count = torch.empty(0, 1)
+
+    def forget(self, rows: Tensor) -> None:
+        """Start new episodes in `rows`, bool [B]."""
+        if len(rows) != len(self._sum):
+            self._sum = torch.zeros(len(rows), self.static_dim, device=rows.device)
+            self._count = torch.zeros(len(rows), 1, device=rows.device)
+        self._sum[rows], self._count[rows] = 0, 0
+
+    def __call__(self, latents: Tensor) -> Tensor:
+        """Latents [B, D] of each row's next frame, the static dimensions replaced by their mean since `forget`."""
+        if self.static_dim == 0:
+            return latents
+        self._sum += latents[:, -self.static_dim :]
+        self._count += 1
+        return torch.cat([latents[:, : -self.static_dim], self._sum / self._count], -1)
+
+
 class VelapAgent:
     """Plans every `n_replan` steps of a row, follows the waypoints by π^l, and hands over to π^g near the goal.
 
@@ -51,6 +76,7 @@ class VelapAgent:
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
         self._device = next(model.parameters()).device
+        self._memory = SceneMemory(model.config.static_dim if config.controller.scene_memory else 0)
         self._generators: list[torch.Generator] = []
         self._plan_age = torch.empty(0, dtype=torch.long)
         self._waypoints = torch.empty(0, 1, 0)
@@ -66,6 +92,7 @@ class VelapAgent:
         started = torch.from_numpy(mask).to(self._device)
         self._plan_age[started] = self._n_replan
         self._length[started] = 0
+        self._memory.forget(started)
 
     def _allocate(self, batch: int) -> None:
         """Empty state for `batch` rows."""
@@ -81,7 +108,7 @@ class VelapAgent:
         """One step of Algorithm 2: frames [B, N, H, W, 3] -> actions [B, A]."""
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
-        latents = self._model.encode(torch.from_numpy(frames).to(self._device))
+        latents = self._memory(self._model.encode(torch.from_numpy(frames).to(self._device)))
         values = self._fns.value(latents)
         near_goal = values > self._stop_value
         self.last_values, self.near_goal = values.float().cpu().numpy(), near_goal.cpu().numpy()
