@@ -172,11 +172,12 @@ class JointLearner:
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch)}
 
     def _constancy(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
-        """Constancy loss of the batch's windows. latents [M, D]."""
+        """Constancy loss of the batch's windows, within groups of windows. latents [M, D]."""
         windows, length = batch.valid.shape
         static = latents[: windows * (length + 1), -self.model.config.static_dim :]
+        scene = torch.arange(windows, device=latents.device) // self.config.group_windows
         inside = nn.functional.pad(batch.valid, (1, 0), value=True)
-        return constancy_loss(static.view(windows, length + 1, -1), inside)
+        return constancy_loss(static, scene.repeat_interleave(length + 1), inside.flatten())
 
     def latent_step(self) -> Info:
         """One update on cached latents: the dynamics by rollout error, the other heads as before (when `latent_heads`)."""

@@ -101,16 +101,18 @@ def reconstruction_loss(decoded: Tensor, frames: Tensor, mean: Tensor, deviation
     return loss, {"loss": loss.detach()}
 
 
-def constancy_loss(static: Tensor, inside: Tensor) -> tuple[Tensor, Info]:
-    """Variance within windows as a share of all variance, ours: 0 where nothing changes along a window, 1 where windows are alike.
+def constancy_loss(static: Tensor, scene: Tensor, inside: Tensor) -> tuple[Tensor, Info]:
+    """Mean distance within scenes over that between scenes, ours: 0 where nothing changes within one, 1 where scenes are alike.
 
-    static [B, F, S], the dimensions that should stay, of each window's frames; inside bool [B, F], frames of the episode.
+    static [M, S], the dimensions of M frames that should stay; scene int64 [M], the group a frame was drawn in; inside bool [M],
+    frames that count. Distances are not squared: a window of another scene in a group does not rule the others.
     """
-    counted = inside.unsqueeze(-1).float()
-    n = counted.sum(1, keepdim=True).clamp(min=1)
-    centre = (static * counted).sum(1, keepdim=True) / n
-    mean = (static * counted).sum((0, 1)) / counted.sum().clamp(min=1)
-    within = ((static - centre).square() * counted).sum()
-    total = ((static - mean).square() * counted).sum()
-    loss = within / total.clamp(min=1e-6)
+    distance = latent_distances(static, static)
+    counted = inside.unsqueeze(1) & inside
+    alike = scene.unsqueeze(1) == scene
+    within = (counted & alike).fill_diagonal_(False).float()
+    between = (counted & ~alike).float()
+    near = (distance * within).sum() / within.sum().clamp(min=1)
+    far = (distance * between).sum() / between.sum().clamp(min=1)
+    loss = near / far.clamp(min=1e-3)
     return loss, {"loss": loss.detach()}
