@@ -141,6 +141,8 @@ def test_act_without_reset_and_with_another_batch(checkpoint: Path, method: str)
     assert agent.act(frames_of(1)).shape == (1, 3)
     assert agent.act(frames_of(2)).shape == (2, 3)
     assert agent.last_plan_ms.shape == (2,)
+    agent.reset(np.array([True, False]))
+    assert agent.act(frames_of(2)).shape == (2, 3)
 
 
 @every_method

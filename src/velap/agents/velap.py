@@ -83,6 +83,7 @@ class VelapAgent:
         self._length = torch.empty(0, dtype=torch.long)
         self._current = torch.empty(0, dtype=torch.long)
 
+    @torch.inference_mode()
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
         """Forget the plans where `mask` [B] is set and seed those rows anew."""
         if len(self._generators) != len(mask):
