@@ -38,6 +38,7 @@ class PlanningAgent(ABC):
         self._generators: list[torch.Generator] = []
         self._age: NDArray[np.int64] = np.empty(0, np.int64)
 
+    @torch.inference_mode()
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
         """Forget the plans where `mask` [B] is set and seed those rows anew."""
         if len(self._generators) != len(mask):
