@@ -13,7 +13,7 @@ from velap.data.episodes import FrameStore
 from velap.errors import CheckpointError, DatasetError
 from velap.models.latent import load_checkpoint
 from velap.runs import load_tensors
-from velap.training.joint import rollouts
+from velap.training.joint import rollouts, shifted
 from velap.training.loop import MODEL, STATE, Trainer, train
 
 SMALL = ModelConfig(
@@ -204,6 +204,36 @@ def test_a_decoded_scene_is_learnt(tmp_path):
     run = trainer(tmp_path, reconstruction=1.0, joint_steps=60, learning_rate=1e-2)
     losses = [float(run.update()["reconstruction/loss"]) for _ in range(60)]
     assert np.mean(losses[-5:]) < np.mean(losses[:5])
+
+
+def test_frames_are_shifted_group_by_group():
+    stacks = torch.arange(3 * 4 * 5).view(3, 1, 4, 5, 1).to(torch.uint8).expand(3, 2, 4, 5, 3)
+    moved = shifted(stacks, 2, torch.tensor([[1, 0], [0, -2]]))
+    assert torch.equal(moved[:2, :, 1:], stacks[:2, :, :-1]) and torch.equal(moved[:2, :, 0], stacks[:2, :, 0])
+    assert torch.equal(moved[2, :, :, :3], stacks[2, :, :, 2:])
+    assert torch.equal(moved[2, :, :, 3:], stacks[2, :, :, 4:].expand(-1, -1, 2, -1)), "the border is repeated"
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_group_of_windows_is_shifted_as_one(tmp_path, whole):
+    run = trainer(tmp_path, shift=2, group_windows=2, batch_windows=4, whole_windows=whole, window=3)
+    sampler = run.sampler
+    batch = sampler.sample(4, 3, whole, run.learner.generator)
+    stacks = sampler.stacks(batch.rows)
+    moved = run.learner._augmented(stacks, batch)
+    assert moved.shape == stacks.shape and moved.dtype == torch.uint8
+    window = torch.cat([torch.arange(16) // 4, torch.arange(len(stacks) - 16)])
+    for group in range(2):
+        rows = torch.isin(window, torch.tensor([2 * group, 2 * group + 1]))
+        fits = [
+            (dy, dx)
+            for dy in range(-2, 3)
+            for dx in range(-2, 3)
+            if torch.equal(moved[rows], shifted(stacks[rows], len(stacks), torch.tensor([[dy, dx]])))
+        ]
+        assert len(fits) == 1
+    run.update()
+    assert torch.equal(trainer(tmp_path / "plain").learner._augmented(stacks, batch), stacks)
 
 
 def test_static_dimensions_outlast_every_step_and_all_training(tmp_path):

@@ -114,6 +114,9 @@ class TrainConfig:
     """Weight of the global critic's loss, Eq. 2, Table 7."""
     c1: float = 0.01
     """Weight of the dynamics loss, Eq. 2, Table 7 (0.001 in SpiralMaze)."""
+    shift: int = 0
+    """Largest random shift of the joint phase's frames, the same for all frames of a group of windows [px]; 0 has none. ours:
+    a hundred scenes are few for an encoder."""
     reconstruction: float = 0.0
     """Weight of the reconstruction loss of the joint phase; 0 has none. ours: Eq. 2 asks the latent only for what a step or
     a value depends on here and now, and far parts of a scene may go missing; the paper does without."""
@@ -195,6 +198,7 @@ class TrainConfig:
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
         for name in ("c0", "c1", "reconstruction", "constancy", "c2", "c3", "kl_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
+        _require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
         _require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
         _require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
         _require(0 < self.target_rate <= 1, "target_rate", self.target_rate, "a rate in (0, 1]")
@@ -384,7 +388,7 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
     "model": ("static_dim",),
-    "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction", "constancy"),
+    "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction", "constancy", "shift"),
     "controller": ("scene_memory",),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""

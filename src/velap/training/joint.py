@@ -67,6 +67,25 @@ def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple
     return torch.stack(predicted), torch.stack(truth), torch.stack(valid)
 
 
+def shifted(stacks: Tensor, group: int, offsets: Tensor) -> Tensor:
+    """Frames moved by whole pixels, each `group` of subsequent rows alike; border pixels are repeated.
+
+    stacks uint8 [M, N, H, W, 3]; offsets int64 [ceil(M / group), 2], downwards and to the right [px].
+    """
+    height, width = stacks.shape[2:4]
+    moved = torch.empty_like(stacks)
+    for source, target, (down, right) in zip(stacks.split(group), moved.split(group), offsets.tolist(), strict=True):
+        # what stays in the picture, then the border rows and columns that it leaves behind
+        top, left = max(down, 0), max(right, 0)
+        bottom, end = height + min(down, 0), width + min(right, 0)
+        target[:, :, top:bottom, left:end] = source[:, :, top - down : bottom - down, left - right : end - right]
+        target[:, :, top:bottom, :left] = target[:, :, top:bottom, left : left + 1]
+        target[:, :, top:bottom, end:] = target[:, :, top:bottom, end - 1 : end]
+        target[:, :, :top] = target[:, :, top : top + 1]
+        target[:, :, bottom:] = target[:, :, bottom - 1 : bottom]
+    return moved
+
+
 class FrameDecoder(MLP):
     """Latents → the newest frame of the stack, shrunk (ours). It learns beside the encoder and is thrown away."""
 
@@ -146,7 +165,7 @@ class JointLearner:
         config = self.config
         batch = self.sampler.sample(config.batch_windows, config.window, config.whole_windows, self.generator)
         self.model_optimizer.zero_grad(set_to_none=True)
-        stacks = self.sampler.stacks(batch.rows)
+        stacks = self._augmented(self.sampler.stacks(batch.rows), batch)
         encoded = self.model.encode(stacks)
         latents = (
             encoded.detach().requires_grad_()
@@ -170,6 +189,21 @@ class JointLearner:
         encoded.backward(latents.grad)
         with self._threads(batch):
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch)}
+
+    def _augmented(self, stacks: Tensor, batch: Batch) -> Tensor:
+        """Stacks [M, N, H, W, 3] shifted at random, each group of windows as one: what it shares stays shared."""
+        most = self.config.shift
+        if most == 0:
+            return stacks
+        windows, length = batch.valid.shape
+        group = self.config.group_windows * (length + 1)
+        count = -(-windows // self.config.group_windows)
+        offsets = torch.randint(-most, most + 1, (count, 2), generator=self.generator, device=stacks.device)
+        whole = windows * (length + 1)
+        parts = [shifted(stacks[:whole], group, offsets)]
+        if len(stacks) > whole:  # one goal a window
+            parts.append(shifted(stacks[whole:], self.config.group_windows, offsets))
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
 
     def _constancy(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
         """Constancy loss of the batch's windows, within groups of windows. latents [M, D]."""
