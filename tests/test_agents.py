@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from toy_env import ACTION_SCALE, SIDE, ToyEnv, ToyModel, draw, toy_config
-from toy_world import DISCOUNT, START
+from toy_world import DISCOUNT, SPEED, START
 from velap.agents.base import make_agent
 from velap.agents.velap import VelapAgent
 from velap.config import override
@@ -78,7 +78,8 @@ def test_waypoints_are_passed_when_reached_several_at_once() -> None:
     agent = VelapAgent(ToyModel(), toy_config(n_iter=20))
     agent.reset(np.ones(1, bool), np.array([0]))
     agent.act(frames_at(START))
-    set_plan(agent, [START, (-5.0, 0.0), (-4.0, 0.0), (-4.0, 5.0), (-4.0, 9.0)])
+    with torch.inference_mode():
+        set_plan(agent, [START, (-5.0, 0.0), (-4.0, 0.0), (-4.0, 5.0), (-4.0, 9.0)])
     assert agent.waypoints_ahead(0)[0].tolist() == [-5.0, 0.0]
 
     action = agent.act(frames_at(START))
@@ -110,6 +111,23 @@ def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: in
     for _ in range(20):
         env.step(agent.act(frames_at(tuple(env.agent_position())))[0])
     assert (env.agent_position()[0] > 0) == gets_there
+
+
+@pytest.mark.parametrize(("residuals", "leaves"), [(0, False), (20, True)])
+def test_residuals_leave_a_wall_that_the_dynamics_walk_through(residuals: int, leaves: bool) -> None:
+    model = ToyModel(step=lambda z, a: z + SPEED * a / a.norm(dim=-1, keepdim=True).clamp(min=1))
+    model.act_local = lambda latent, goal: (goal - latent) / (goal - latent).norm(dim=-1, keepdim=True)
+    agent = VelapAgent(model, override(toy_config(n_iter=1), controller={"residuals": residuals, "n_replan": 100}))
+    env, start = ToyEnv(), (-0.1, 2.0)
+    env.reset(seed=0)
+    env.set_agent_position(np.array(start))
+    model.encode = lambda frames: torch.from_numpy(env.agent_position())[None]
+    agent.act(frames_at(start))
+    with torch.inference_mode():
+        set_plan(agent, [start, (5.0, 2.0)])
+    for _ in range(10):
+        env.step(agent.act(frames_at(tuple(env.agent_position())))[0])
+    assert (env.agent_position()[1] != start[1]) == leaves
 
 
 def test_plan_of_the_root_alone_leaves_it_to_the_global_policy() -> None:

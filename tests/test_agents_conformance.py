@@ -36,7 +36,7 @@ def small_config() -> Config:
              "encoder_strides": (2, 2), "encoder_dense": (8,), "dynamics_dense": (16, 16), "generative_dense": (16,),
              "noise_dim": 2, "policy_dense": (16,), "critic_dense": (16, 16)}
     base = Config(task="toy", preset="default")
-    return override(base, model=model, controller={"n_replan": 4}, train={"precision": "float32"},
+    return override(base, model=model, controller={"n_replan": 4, "residuals": 3}, train={"precision": "float32"},
                     planner={"n_iter": 12, "candidates": 4, "n_sim": 2, "discard_std": 10.0, "discard_low_exponent": 1e4,
                              "discard_high_exponent": 1e-6})
 

@@ -33,7 +33,7 @@ def test_what_is_ours_is_off_in_the_paper_preset() -> None:
     assert config.train.latent_steps == 0
     assert not config.train.whole_windows
     assert (config.train.group_windows, config.train.anneal, config.train.reconstruction) == (1, False, 0)
-    assert (config.model.static_dim, config.train.constancy, config.train.shift) == (0, 0, 0)
+    assert (config.train.shift, config.controller.residuals) == (0, 0)
     assert not config.planner.coherent_noise
     assert config.planner.anchor == "none"
 
@@ -69,11 +69,11 @@ def test_records_older_than_a_field_keep_their_hash() -> None:
 @pytest.mark.parametrize(("part", "field", "value"), [
     (TrainConfig, "group_windows", 0), (TrainConfig, "group_reach", 0), (TrainConfig, "group_goals", 1.5),
     (ModelConfig, "frame_stack", 0), (ModelConfig, "norm", "group"), (ModelConfig, "encoder_filters", (32,)),
-    (ModelConfig, "n_ens", 0), (ModelConfig, "static_dim", 32), (TrainConfig, "constancy", -1.0), (TrainConfig, "shift", 17),
+    (ModelConfig, "n_ens", 0), (TrainConfig, "shift", 17),
     (TrainConfig, "discount", 1.0), (TrainConfig, "relabel_next", 0.5),
     (TrainConfig, "learning_rate", 0.0), (TrainConfig, "window", 2), (TrainConfig, "dynamics_loss", "l1"),
     (PlannerConfig, "n_iter", 0), (PlannerConfig, "p_sparse", 0.9), (PlannerConfig, "temperature_value", 0.0),
-    (PlannerConfig, "anchor", "glue"), (ControllerConfig, "n_replan", 0),
+    (PlannerConfig, "anchor", "glue"), (ControllerConfig, "n_replan", 0), (ControllerConfig, "residuals", -1),
 ])
 def test_values_out_of_range_name_their_field(part: type, field: str, value: object) -> None:
     with pytest.raises(ConfigError, match=field):

@@ -236,37 +236,12 @@ def test_a_group_of_windows_is_shifted_as_one(tmp_path, whole):
     assert torch.equal(trainer(tmp_path / "plain").learner._augmented(stacks, batch), stacks)
 
 
-def test_static_dimensions_outlast_every_step_and_all_training(tmp_path):
-    held = dataclasses.replace(SMALL, static_dim=3)
-    run = Trainer(config(held, constancy=0.5), make_store(), tmp_path, 0, torch.device("cpu"))
-    assert "constancy/loss" in run.update()
-    for _ in range(11):
-        run.update()
-    latents, actions = torch.randn(7, 4), torch.rand(7, 3) * 2 - 1
-    following = run.model.step(latents, actions)
-    assert torch.equal(following[:, 1:], latents[:, 1:])
-    assert not torch.equal(following[:, 0], latents[:, 0])
-    run.finish("x")
-    again, _, _ = load_checkpoint(tmp_path / MODEL)
-    functions = again.search_fns()
-    assert torch.equal(functions["step"](latents.clone(), actions)[:, 1:], latents[:, 1:])
-    if functions["rollout"] is not None:
-        assert torch.equal(functions["rollout"](latents, torch.randn(7, 1, 2), 4)[:, 1:], latents[:, 1:])
-
-
-def test_constancy_settles_what_is_static(tmp_path):
-    held = dataclasses.replace(SMALL, static_dim=3)
-    run = Trainer(config(held, constancy=1.0, joint_steps=60, learning_rate=1e-2), make_store(), tmp_path, 0, torch.device("cpu"))
-    losses = [float(run.update()["constancy/loss"]) for _ in range(60)]
-    assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
-
-
 def test_runs_older_than_a_field_can_be_resumed(tmp_path):
     run = trainer(tmp_path)
     run.update()
     run.save()
     _, metadata = load_tensors(tmp_path / STATE)
-    assert not [name for name in ("anneal", "group_windows", "static_dim", "constancy") if name in metadata["config"]]
+    assert not [name for name in ("anneal", "group_windows", "shift", "reconstruction") if name in metadata["config"]]
     trainer(tmp_path).resume()
 
 

@@ -8,7 +8,6 @@ from torch import tensor
 
 from velap.training.losses import (
     action_model_loss,
-    constancy_loss,
     critic_loss,
     infonce_loss,
     policy_loss,
@@ -122,16 +121,3 @@ def test_reconstruction_is_one_for_the_mean_frame():
     exact = torch.tensor([[-1.0, 1.0], [1.0, -1.0]])
     assert reconstruction_loss(exact, frames, mean, deviation)[0].item() == pytest.approx(0.0, abs=1e-12)
     assert reconstruction_loss(exact + 2, frames, mean, deviation)[0].item() == pytest.approx(4.0)
-
-
-def test_constancy_compares_distances_within_and_between_scenes():
-    static, scene = torch.tensor([[0.0], [2.0], [10.0], [50.0]]), torch.tensor([0, 0, 1, 1])
-    inside = torch.tensor([True, True, True, False])
-    loss, info = constancy_loss(static, scene, inside)
-    assert loss.item() == pytest.approx(2 / 9, rel=1e-4), "one pair within, 2 apart; two between, 10 and 8 apart"
-    assert info["loss"].item() == loss.item()
-    alike = constancy_loss(torch.tensor([[1.0], [1.0], [3.0], [3.0]]), scene, torch.ones(4, dtype=torch.bool))[0]
-    assert alike.item() == pytest.approx(0.0, abs=1e-2)
-    still = torch.zeros(4, 1, requires_grad=True)
-    constancy_loss(still, scene, inside)[0].backward()
-    assert torch.isfinite(still.grad).all()

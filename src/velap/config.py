@@ -62,9 +62,6 @@ class ModelConfig:
     """Members of the local ensemble, Table 7."""
     n_global: int = 2
     """Members of the global critic, of which the minimum counts (TD3's two). ours; 1 in `paper`: Eq. 4 has no minimum."""
-    static_dim: int = 0
-    """Last dimensions of the latent that h leaves as they are: what stays in an episode, such as the scene, cannot drift along
-    a rollout. 0 has none. ours; needs `dynamics_residual`."""
     latent_norm: bool = False
     """Latents are normalised to zero mean and unit variance over their dimensions. ours; off in `paper`."""
     bank_size: int = 4096
@@ -76,12 +73,6 @@ class ModelConfig:
         _require(self.norm in get_args(Norm), "norm", self.norm, f"one of {get_args(Norm)}")
         sizes = {len(self.encoder_filters), len(self.encoder_kernels), len(self.encoder_strides)}
         _require(len(sizes) == 1, "encoder_filters", self.encoder_filters, "as many filters as kernels and strides")
-        _require(
-            0 <= self.static_dim < self.latent_dim, "static_dim", self.static_dim, f"0 to latent_dim - 1 = {self.latent_dim - 1}"
-        )
-        _require(
-            self.static_dim == 0 or self.dynamics_residual, "static_dim", self.static_dim, "0 where dynamics_residual is off"
-        )
         _require(self.noise_dim >= 1, "noise_dim", self.noise_dim, "a positive number of units")
         _require(self.n_ens >= 1, "n_ens", self.n_ens, "at least one critic")
         _require(self.n_global >= 1, "n_global", self.n_global, "at least one critic")
@@ -115,13 +106,11 @@ class TrainConfig:
     c1: float = 0.01
     """Weight of the dynamics loss, Eq. 2, Table 7 (0.001 in SpiralMaze)."""
     shift: int = 0
-    """Largest random shift of the joint phase's frames, the same for all frames of a group of windows [px]; 0 has none. ours:
-    a hundred scenes are few for an encoder."""
+    """Largest random shift of the joint phase's frames, the same for all frames of a group of windows [px]; 0 has none.
+    ours: a hundred scenes are few for an encoder."""
     reconstruction: float = 0.0
     """Weight of the reconstruction loss of the joint phase; 0 has none. ours: Eq. 2 asks the latent only for what a step or
     a value depends on here and now, and far parts of a scene may go missing; the paper does without."""
-    constancy: float = 0.0
-    """Weight of the constancy loss of the joint phase on the `static_dim` dimensions; 0 has none. ours."""
     c2: float = 0.001
     """Weight of imitation in the local policy, Eq. 5, Table 7."""
     c3: float = 0.001
@@ -196,7 +185,7 @@ class TrainConfig:
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("learning_rate", "latent_learning_rate", "temperature"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        for name in ("c0", "c1", "reconstruction", "constancy", "c2", "c3", "kl_weight"):
+        for name in ("c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         _require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
         _require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
@@ -301,11 +290,12 @@ class ControllerConfig:
     by π^l alone [steps]. ours: π^l pushes into walls at corners that h knows of; 0 in `paper`."""
     lookahead_samples: int = 32
     """Actions drawn from g for the lookahead. ours."""
-    scene_memory: bool = False
-    """The `static_dim` dimensions of a state are averaged over the episode so far. ours; off in `paper`."""
+    residuals: int = 0
+    """Last steps of the episode whose prediction errors correct h in the lookahead; 0 trusts h [steps]. ours."""
 
     def __post_init__(self) -> None:
         _require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")
+        _require(self.residuals >= 0, "residuals", self.residuals, "0 or more steps")
         _require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
         _require(self.lookahead_samples >= 1, "lookahead_samples", self.lookahead_samples, "at least 1 action")
 
@@ -387,9 +377,8 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "model": ("static_dim",),
-    "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction", "constancy", "shift"),
-    "controller": ("scene_memory",),
+    "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction", "shift"),
+    "controller": ("residuals",),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from velap.agents.base import masked_seeds
+from velap.agents.residuals import Residuals
 from velap.models.horizon import q_from_steps
 from velap.search.est import plan
 from velap.search.types import Plan, SearchFns
@@ -21,31 +22,6 @@ from velap.search.types import Plan, SearchFns
 if TYPE_CHECKING:
     from velap.config import Config
     from velap.models.latent import LatentModel
-
-
-class SceneMemory:
-    """The static dimensions of a latent, averaged over the episode so far (ours): one frame tells the scene less exactly."""
-
-    def __init__(self, static_dim: int) -> None:
-        self.static_dim = static_dim
-        """S, last dimensions of a latent that are averaged; 0 leaves all as they are."""
-        self._sum = torch.empty(0, 0)
-        self._count = torch.empty(0, 1)
-
-    def forget(self, rows: Tensor) -> None:
-        """Start new episodes in `rows`, bool [B]."""
-        if len(rows) != len(self._sum):
-            self._sum = torch.zeros(len(rows), self.static_dim, device=rows.device)
-            self._count = torch.zeros(len(rows), 1, device=rows.device)
-        self._sum[rows], self._count[rows] = 0, 0
-
-    def __call__(self, latents: Tensor) -> Tensor:
-        """Latents [B, D] of each row's next frame, the static dimensions replaced by their mean since `forget`."""
-        if self.static_dim == 0:
-            return latents
-        self._sum += latents[:, -self.static_dim :]
-        self._count += 1
-        return torch.cat([latents[:, : -self.static_dim], self._sum / self._count], -1)
 
 
 class VelapAgent:
@@ -76,7 +52,9 @@ class VelapAgent:
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
         self._device = next(model.parameters()).device
-        self._memory = SceneMemory(model.config.static_dim if config.controller.scene_memory else 0)
+        self._residuals: Residuals | None = None
+        if config.controller.residuals and config.controller.lookahead:
+            self._residuals = Residuals(config.controller.residuals, self._fns.step, self._fns.step_distance)
         self._generators: list[torch.Generator] = []
         self._plan_age = torch.empty(0, dtype=torch.long)
         self._waypoints = torch.empty(0, 1, 0)
@@ -93,7 +71,8 @@ class VelapAgent:
         started = torch.from_numpy(mask).to(self._device)
         self._plan_age[started] = self._n_replan
         self._length[started] = 0
-        self._memory.forget(started)
+        if self._residuals is not None:
+            self._residuals.forget(started)
 
     def _allocate(self, batch: int) -> None:
         """Empty state for `batch` rows."""
@@ -109,7 +88,9 @@ class VelapAgent:
         """One step of Algorithm 2: frames [B, N, H, W, 3] -> actions [B, A]."""
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
-        latents = self._memory(self._model.encode(torch.from_numpy(frames).to(self._device)))
+        latents = self._model.encode(torch.from_numpy(frames).to(self._device))
+        if self._residuals is not None:
+            self._residuals.observe(latents)
         values = self._fns.value(latents)
         near_goal = values > self._stop_value
         self.last_values, self.near_goal = values.float().cpu().numpy(), near_goal.cpu().numpy()
@@ -124,6 +105,8 @@ class VelapAgent:
             rows = torch.arange(len(latents), device=self._device)
             local = self._act_local(latents, self._waypoints[rows, self._current])
             actions = torch.where(by_waypoint[:, None], local, actions)
+        if self._residuals is not None:
+            self._residuals.acted(latents, actions)
         return self._model.to_env(actions)
 
     def _act_local(self, latents: Tensor, waypoints: Tensor) -> Tensor:
@@ -141,8 +124,9 @@ class VelapAgent:
         starts = latents.unsqueeze(1).expand(-1, self._samples + 1, -1)
         actions = torch.cat([policy.unsqueeze(1), self._fns.propose(starts[:, 1:], noise)], 1)
         ends = starts
+        step = self._fns.step if self._residuals is None else self._residuals.step
         for _ in range(self._lookahead):
-            ends = self._fns.step(ends, actions)
+            ends = step(ends, actions)
         q_min, _ = self._fns.reach(ends, waypoints.unsqueeze(1).expand_as(ends))
         return actions[torch.arange(len(actions), device=actions.device), q_min.argmax(1)]
 

@@ -47,8 +47,6 @@ class LatentModel(nn.Module):
         latent, action, norm = config.latent_dim, len(spaces.action_low), config.norm
         self.encoder = Encoder(config, (spaces.height, spaces.width), precision)
         self.dynamics = MLP(latent + action, config.dynamics_dense, latent, norm)
-        if config.static_dim:
-            hold_still(self.dynamics[-1], config.static_dim)
         self.action_model = ConditionalVAE(latent, action, config.noise_dim, config.generative_dense, norm, bounded=True)
         self.local_policy = Policy(2 * latent, config.policy_dense, action, norm)
         self.global_policy = Policy(latent, config.policy_dense, action, norm)
@@ -214,20 +212,6 @@ class LatentModel(nn.Module):
             return found, (found - latent).norm(dim=-1)
 
         return project
-
-
-def hold_still(layer: nn.Module, outputs: int) -> None:
-    """The last `outputs` of a dense layer are 0 and stay so: their weights start at 0 and get no gradient."""
-    for parameter in layer.parameters():
-        with torch.no_grad():
-            parameter[-outputs:] = 0
-
-        def without_held(gradient: Tensor) -> Tensor:
-            kept = gradient.clone()
-            kept[-outputs:] = 0
-            return kept
-
-        parameter.register_hook(without_held)
 
 
 MODEL_FORMAT = "velap-latent-model/1"

@@ -23,7 +23,6 @@ from velap.threads import one_thread
 from velap.training.losses import (
     Info,
     action_model_loss,
-    constancy_loss,
     critic_loss,
     infonce_loss,
     policy_loss,
@@ -182,9 +181,6 @@ class JointLearner:
             if self.decoder is not None:
                 reconstruction, pixels = self.decoder.loss(latents, stacks, self.generator)
                 loss, more = loss + config.reconstruction * reconstruction, {**more, "reconstruction/loss": pixels["loss"]}
-            if config.constancy > 0 and self.model.config.static_dim:
-                constancy, parts = self._constancy(latents, batch)
-                loss, more = loss + config.constancy * constancy, {**more, "constancy/loss": parts["loss"]}
             loss.backward()
         encoded.backward(latents.grad)
         with self._threads(batch):
@@ -204,14 +200,6 @@ class JointLearner:
         if len(stacks) > whole:  # one goal a window
             parts.append(shifted(stacks[whole:], self.config.group_windows, offsets))
         return torch.cat(parts) if len(parts) > 1 else parts[0]
-
-    def _constancy(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
-        """Constancy loss of the batch's windows, within groups of windows. latents [M, D]."""
-        windows, length = batch.valid.shape
-        static = latents[: windows * (length + 1), -self.model.config.static_dim :]
-        scene = torch.arange(windows, device=latents.device) // self.config.group_windows
-        inside = nn.functional.pad(batch.valid, (1, 0), value=True)
-        return constancy_loss(static, scene.repeat_interleave(length + 1), inside.flatten())
 
     def latent_step(self) -> Info:
         """One update on cached latents: the dynamics by rollout error, the other heads as before (when `latent_heads`)."""

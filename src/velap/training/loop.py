@@ -146,8 +146,7 @@ class Trainer:
         train = older_fields("train", asdict(self.config.train))
         late = () if self.config.train.anneal else ("joint_steps",)
         schedule = {name: train.pop(name) for name in sorted(train) if name in late or name.startswith("latent_")}
-        model = older_fields("model", asdict(self.config.model))
-        learned = {"task": self.config.task, "model": model, "train": train}
+        learned = {"task": self.config.task, "model": asdict(self.config.model), "train": train}
         return {
             "config": json.dumps(learned, sort_keys=True),
             SCHEDULE: json.dumps(schedule),

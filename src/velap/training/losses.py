@@ -99,20 +99,3 @@ def reconstruction_loss(decoded: Tensor, frames: Tensor, mean: Tensor, deviation
     """
     loss = (decoded - (frames - mean) / deviation).square().mean()
     return loss, {"loss": loss.detach()}
-
-
-def constancy_loss(static: Tensor, scene: Tensor, inside: Tensor) -> tuple[Tensor, Info]:
-    """Mean distance within scenes over that between scenes, ours: 0 where nothing changes within one, 1 where scenes are alike.
-
-    static [M, S], the dimensions of M frames that should stay; scene int64 [M], the group a frame was drawn in; inside bool [M],
-    frames that count. Distances are not squared: a window of another scene in a group does not rule the others.
-    """
-    distance = latent_distances(static, static)
-    counted = inside.unsqueeze(1) & inside
-    alike = scene.unsqueeze(1) == scene
-    within = (counted & alike).fill_diagonal_(False).float()
-    between = (counted & ~alike).float()
-    near = (distance * within).sum() / within.sum().clamp(min=1)
-    far = (distance * between).sum() / between.sum().clamp(min=1)
-    loss = near / far.clamp(min=1e-3)
-    return loss, {"loss": loss.detach()}

@@ -1,0 +1,78 @@
+"""What the last steps of an episode showed h to be wrong about (ours).
+
+B environments, M steps remembered, K queries a row, D latent dimensions, A action dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Step = Callable[[Tensor, Tensor], Tensor]
+"""h: `[*, D], [*, A] → [*, D]`."""
+
+
+class Residuals:
+    """h corrected by its own errors: a block that pushes against a wall which h does not see comes to expect to stay.
+
+    The error of every step that was taken is remembered with its latent and action, and added to predictions from nearby
+    latents by similar actions, weighted by a Gaussian kernel.
+    """
+
+    LATENT_WIDTH = 1.0
+    """Width of the kernel over latents [one-step lengths]."""
+    ACTION_WIDTH = 0.5
+    """Width of the kernel over actions in [-1, 1]."""
+    LEAST_ERROR = 0.4
+    """Smaller errors are left alone [one-step lengths]."""
+
+    def __init__(self, size: int, step: Step, step_distance: float) -> None:
+        self.size = size
+        """M, steps remembered."""
+        self._step = step
+        self._width = self.LATENT_WIDTH * max(step_distance, 1e-6)
+        self._least = self.LEAST_ERROR * max(step_distance, 1e-6)
+        self._latents = self._actions = self._errors = torch.empty(0, 0, 0)
+        self._known = torch.empty(0, 0)
+        self._acted = torch.empty(0, dtype=torch.bool)
+        self._taken = 0
+
+    def forget(self, rows: Tensor) -> None:
+        """Start new episodes in `rows`, bool [B]."""
+        if len(rows) != len(self._known):
+            self._known = torch.zeros(len(rows), self.size, device=rows.device)
+            self._acted = torch.zeros_like(rows)
+            self._latents = self._actions = self._errors = torch.empty(0, 0, 0, device=rows.device)
+        self._known[rows] = 0
+        self._acted[rows] = False
+
+    def observe(self, latents: Tensor) -> None:
+        """The latents [B, D] that the last actions led to."""
+        if self._acted.any():
+            slot = (self._taken - 1) % self.size
+            error = latents - self._step(self._latents[:, slot], self._actions[:, slot])
+            counts = self._acted & (error.norm(dim=-1) > self._least)
+            self._errors[:, slot], self._known[:, slot] = error, counts.float()
+
+    def acted(self, latents: Tensor, actions: Tensor) -> None:
+        """The actions [B, A] in [-1, 1] that are taken from latents [B, D] now."""
+        if self._latents.shape[1:] != (self.size, latents.shape[1]):
+            self._latents = latents.new_zeros(len(latents), self.size, latents.shape[1])
+            self._errors = torch.zeros_like(self._latents)
+            self._actions = actions.new_zeros(len(actions), self.size, actions.shape[1])
+        slot = self._taken % self.size
+        self._latents[:, slot], self._actions[:, slot], self._known[:, slot] = latents, actions, 0
+        self._acted[:] = True
+        self._taken += 1
+
+    def step(self, latents: Tensor, actions: Tensor) -> Tensor:
+        """h, corrected: `[B, K, D], [B, K, A] → [B, K, D]`."""
+        predicted = self._step(latents, actions)
+        if not self._known.any():
+            return predicted
+        off = torch.cdist(latents, self._latents) / self._width
+        turned = torch.cdist(actions, self._actions) / self.ACTION_WIDTH
+        weight = (-(off.square() + turned.square())).exp() * self._known.unsqueeze(1)
+        return predicted + weight @ self._errors / weight.sum(-1, keepdim=True).clamp(min=1)
