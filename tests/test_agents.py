@@ -130,6 +130,24 @@ def test_residuals_leave_a_wall_that_the_dynamics_walk_through(residuals: int, l
     assert (env.agent_position()[1] != start[1]) == leaves
 
 
+def test_plans_grow_along_the_corrected_dynamics() -> None:
+    model = ToyModel(step=lambda z, a: z + SPEED * a / a.norm(dim=-1, keepdim=True).clamp(min=1))
+    agent = VelapAgent(model, override(toy_config(n_iter=40), controller={"residuals": 20, "n_replan": 3}))
+    stuck = frames_at(START, START)
+    agent.reset(np.ones(2, bool), np.array([1, 1]))
+    agent.act(stuck)
+    assert agent.last_plan_rows.tolist() == [0, 1]
+    first = agent.last_plan
+    assert first is not None
+    for _ in range(3):
+        agent.act(stuck)  # whatever it does, it stays
+    assert agent.planned_rows.tolist() == [0, 1]
+    assert len(agent.last_plan_rows) == 1, "rows with corrections plan alone"
+    assert np.isfinite(agent.last_plan_ms).all()
+    assert agent.last_plan is not None
+    assert not torch.equal(agent.last_plan.tree.latents[0, 1], first.tree.latents[0, 1])
+
+
 def test_plan_of_the_root_alone_leaves_it_to_the_global_policy() -> None:
     nowhere = ToyModel(step=lambda z, a: z)
     agent = VelapAgent(nowhere, toy_config(n_iter=20))

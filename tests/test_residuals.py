@@ -28,6 +28,9 @@ def pushed(size: int = 4, moved: float = 0.0) -> Residuals:
 
 
 def predict(residuals: Residuals, at: float, action: torch.Tensor) -> float:
+    alone = residuals.of_row(0)
+    if alone is not None:
+        torch.testing.assert_close(alone(tensor([[at]]), action), residuals.step(tensor([[[at]]]), action.unsqueeze(0))[0])
     return residuals.step(tensor([[[at]]]), action.unsqueeze(0)).item()
 
 
@@ -53,6 +56,8 @@ def test_corrections_of_several_steps_are_averaged_and_never_add_up() -> None:
 
 def test_small_errors_are_not_kept() -> None:
     assert predict(pushed(moved=0.9), 0.0, RIGHT) == pytest.approx(1.0)
+    assert pushed(moved=0.9).of_row(0) is None
+    assert pushed().of_row(0) is not None
 
 
 def test_only_the_last_steps_are_remembered() -> None:

@@ -291,7 +291,7 @@ class ControllerConfig:
     lookahead_samples: int = 32
     """Actions drawn from g for the lookahead. ours."""
     residuals: int = 0
-    """Last steps of the episode whose prediction errors correct h in the lookahead; 0 trusts h [steps]. ours."""
+    """Last steps of the episode whose prediction errors correct h in lookahead and plans; 0 trusts h [steps]. ours."""
 
     def __post_init__(self) -> None:
         _require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")

@@ -69,10 +69,23 @@ class Residuals:
 
     def step(self, latents: Tensor, actions: Tensor) -> Tensor:
         """h, corrected: `[B, K, D], [B, K, A] → [B, K, D]`."""
-        predicted = self._step(latents, actions)
         if not self._known.any():
-            return predicted
-        off = torch.cdist(latents, self._latents) / self._width
-        turned = torch.cdist(actions, self._actions) / self.ACTION_WIDTH
-        weight = (-(off.square() + turned.square())).exp() * self._known.unsqueeze(1)
-        return predicted + weight @ self._errors / weight.sum(-1, keepdim=True).clamp(min=1)
+            return self._step(latents, actions)
+        return self._corrected(latents, actions, self._latents, self._actions, self._errors, self._known.unsqueeze(1))
+
+    def of_row(self, row: int) -> Step | None:
+        """h as one row corrects it, `[R, D], [R, A] → [R, D]`; None where it has nothing to correct."""
+        known = self._known[row] > 0
+        if not known.any():
+            return None
+        memory = self._latents[row, known], self._actions[row, known], self._errors[row, known]
+        ones = torch.ones(1, int(known.sum()), device=known.device)
+        return lambda latents, actions: self._corrected(latents, actions, *memory, ones)
+
+    def _corrected(
+        self, latents: Tensor, actions: Tensor, places: Tensor, taken: Tensor, errors: Tensor, counts: Tensor
+    ) -> Tensor:
+        """h with the errors [*, M, D] made at `places` [*, M, D] by `taken` [*, M, A], of which `counts` [*, 1, M] count."""
+        off, turned = torch.cdist(latents, places) / self._width, torch.cdist(actions, taken) / self.ACTION_WIDTH
+        weight = (-(off.square() + turned.square())).exp() * counts
+        return self._step(latents, actions) + weight @ errors / weight.sum(-1, keepdim=True).clamp(min=1)

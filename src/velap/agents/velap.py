@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from velap.agents.base import masked_seeds
-from velap.agents.residuals import Residuals
+from velap.agents.residuals import Residuals, Step
 from velap.models.horizon import q_from_steps
 from velap.search.est import plan
 from velap.search.types import Plan, SearchFns
@@ -37,9 +37,11 @@ class VelapAgent:
         self.frame_stack = config.model.frame_stack
         self.last_plan_ms: NDArray[np.float64] = np.empty(0)
         self.last_plan: Plan | None = None
-        """Plan of the rows `planned_rows`, kept for figures and videos."""
+        """A plan of the last `act` that planned, kept for figures and videos."""
+        self.last_plan_rows: NDArray[np.int64] = np.empty(0, np.int64)
+        """Rows of `last_plan`. Rows whose dynamics are corrected plan alone."""
         self.planned_rows: NDArray[np.int64] = np.empty(0, np.int64)
-        """[P] rows that planned in the last `act`."""
+        """Rows that planned in the last `act`."""
         self.last_values: NDArray[np.float32] = np.empty(0, np.float32)
         """[B] Q^g of the last states [Q-value]."""
         self.near_goal: NDArray[np.bool_] = np.empty(0, bool)
@@ -136,13 +138,26 @@ class VelapAgent:
         self.planned_rows = np.flatnonzero(due.cpu().numpy())
         if len(self.planned_rows) == 0:
             return
-        rows = torch.from_numpy(self.planned_rows).to(self._device)
+        corrected = {int(row): step for row in self.planned_rows if (step := self._correction(int(row))) is not None}
+        plain = np.array([row for row in self.planned_rows if int(row) not in corrected], np.int64)
+        if len(plain):
+            self._plan(self._fns, plain, latents)
+        for row, step in corrected.items():
+            self._plan(self._fns._replace(step=step, rollout=None), np.array([row]), latents)
+
+    def _correction(self, row: int) -> Step | None:
+        """h as the row's episode corrects it, where it does."""
+        return self._residuals.of_row(row) if self._residuals is not None else None
+
+    def _plan(self, fns: SearchFns, planned: NDArray[np.int64], latents: Tensor) -> None:
+        """Plan for the rows `planned` [P] from `latents` [B, D] together."""
+        rows = torch.from_numpy(planned).to(self._device)
         start = time.perf_counter()
-        result = plan(self._fns, latents[rows], self._planner, [self._generators[row] for row in self.planned_rows])
+        result = plan(fns, latents[rows], self._planner, [self._generators[row] for row in planned])
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
-        self.last_plan_ms[self.planned_rows] = (time.perf_counter() - start) * 1e3 / len(self.planned_rows)
-        self.last_plan = result
+        self.last_plan_ms[planned] = (time.perf_counter() - start) * 1e3 / len(planned)
+        self.last_plan, self.last_plan_rows = result, planned
         self._store(rows, result.waypoints, result.length)
 
     def _store(self, rows: Tensor, waypoints: Tensor, length: Tensor) -> None:
