@@ -390,8 +390,25 @@ def older_fields(part: str, values: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-DEFAULT_TRAIN: dict[str, Any] = {"group_windows": 6}
-"""The default preset beyond the fields' own defaults."""
+DEFAULT_TRAIN: dict[str, Any] = {
+    "joint_steps": 5_000,
+    "group_windows": 6,
+    "group_reach": 4,
+    "reconstruction": 0.05,
+}
+"""The default preset beyond the fields' own defaults: training for many scenes."""
+DEFAULT_CONTROLLER: dict[str, Any] = {"residuals": 40, "n_replan": 8, "waypoint_exponent": 1.5}
+"""The default preset beyond the fields' own defaults: models of new scenes err at corners."""
+ONE_SCENE: dict[str, dict[str, Any]] = {
+    "train": {
+        "joint_steps": 4_000,
+        "group_windows": 1,
+        "group_reach": 8,
+        "reconstruction": 0.0,
+    },
+    "controller": {"residuals": 0, "n_replan": 15, "waypoint_exponent": 3.0},
+}
+"""What replaces both where all episodes share one scene: there a short training knows it exactly."""
 PAPER_MODEL: dict[str, Any] = {
     "norm": "batch",
     "dynamics_residual": False,

@@ -5,7 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from velap.config import DEFAULT_TRAIN, PAPER_CONTROLLER, PAPER_MODEL, PAPER_PLANNER, PAPER_TRAIN, Config, override
+from velap.config import (
+    DEFAULT_CONTROLLER,
+    DEFAULT_TRAIN,
+    ONE_SCENE,
+    PAPER_CONTROLLER,
+    PAPER_MODEL,
+    PAPER_PLANNER,
+    PAPER_TRAIN,
+    Config,
+    override,
+)
 from velap.errors import UnknownTaskError
 
 PRESETS = ("default", "paper")
@@ -55,7 +65,7 @@ class Task:
 
 
 _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
-    "train": {"c1": 0.02},
+    "train": {"c1": 0.02, "c3": 0.1, "latent_horizon": 15},
     "planner": {
         "n_iter": 500,
         "discard_low_exponent": 20.0,
@@ -65,7 +75,7 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "expansion_weight": 1.0,
         "anchor": "none",
     },
-    "controller": {"n_replan": 15},
+    "controller": {"n_replan": 8},
 }
 """ours: the manipulation tasks plan like SpiralMaze does by default."""
 
@@ -85,8 +95,7 @@ TASKS: dict[str, Task] = {
                 "controller": {"n_replan": 25},
             },
             default_overrides={
-                # one scene alone: windows drawn together would only be more alike
-                "train": {"c1": 0.02, "group_windows": 1},
+                "train": {**ONE_SCENE["train"], "c1": 0.02},
                 "planner": {
                     "n_iter": 1000,
                     "discard_low_exponent": 20.0,
@@ -96,7 +105,7 @@ TASKS: dict[str, Task] = {
                     "expansion_weight": 1.0,
                     "anchor": "snap",
                 },
-                "controller": {"n_replan": 15},
+                "controller": ONE_SCENE["controller"],
             },
         ),
         Task(
@@ -108,7 +117,7 @@ TASKS: dict[str, Task] = {
             # Tables 7-9 give it the values that most tasks have: c1 = 0.01, n_iter 250, n_sim 5, n_replan 15
             overrides={"model": {"frame_stack": 1}},
             default_overrides={
-                "train": {"c1": 0.02},
+                "train": {"c1": 0.02, "rewarded_share": 0.01},
                 "planner": {
                     "n_iter": 500,
                     "discard_low_exponent": 10.0,
@@ -196,7 +205,7 @@ def make_config(task: str, preset: str = "default") -> Config:
     if preset == "paper":
         config = override(config, model=PAPER_MODEL, train=PAPER_TRAIN, planner=PAPER_PLANNER, controller=PAPER_CONTROLLER)
     else:
-        config = override(config, train=DEFAULT_TRAIN)
+        config = override(config, train=DEFAULT_TRAIN, controller=DEFAULT_CONTROLLER)
     if task in TASKS:
         config = override(config, **TASKS[task].overrides)
         if preset == "default":
