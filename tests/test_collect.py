@@ -163,7 +163,13 @@ def test_behaviours_are_mixed_in_their_shares(monkeypatch: pytest.MonkeyPatch):
 
 def start(root: Path, delay: float) -> subprocess.Popen[bytes]:
     environment = {**os.environ, "LINE_DELAY": str(delay), "PYTHONPATH": os.pathsep.join(sys.path)}
-    return subprocess.Popen([sys.executable, "-c", SCRIPT], env=environment, stderr=subprocess.PIPE, start_new_session=True)
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT],
+        env=environment,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
+    )
 
 
 def wait_for(found, seconds: float = 30.0) -> None:

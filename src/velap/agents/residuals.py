@@ -36,25 +36,26 @@ class Residuals:
         self._least = self.LEAST_ERROR * max(step_distance, 1e-6)
         self._latents = self._actions = self._errors = torch.empty(0, 0, 0)
         self._known = torch.empty(0, 0)
-        self._acted = torch.empty(0, dtype=torch.bool)
-        self._taken = 0
+        self._taken = torch.empty(0, dtype=torch.long)
+        """[B] steps that were taken in each row's episode; where they go does not depend on earlier episodes."""
 
     def forget(self, rows: Tensor) -> None:
         """Start new episodes in `rows`, bool [B]."""
         if len(rows) != len(self._known):
             self._known = torch.zeros(len(rows), self.size, device=rows.device)
-            self._acted = torch.zeros_like(rows)
+            self._taken = torch.zeros_like(rows, dtype=torch.long)
             self._latents = self._actions = self._errors = torch.empty(0, 0, 0, device=rows.device)
-        self._known[rows] = 0
-        self._acted[rows] = False
+        self._known[rows], self._taken[rows] = 0, 0
 
     def observe(self, latents: Tensor) -> None:
         """The latents [B, D] that the last actions led to."""
-        if self._acted.any():
-            slot = (self._taken - 1) % self.size
-            error = latents - self._step(self._latents[:, slot], self._actions[:, slot])
-            counts = self._acted & (error.norm(dim=-1) > self._least)
-            self._errors[:, slot], self._known[:, slot] = error, counts.float()
+        if self._latents.shape[:2] != self._known.shape:
+            return
+        row, slot = torch.arange(len(latents), device=latents.device), (self._taken - 1) % self.size
+        error = latents - self._step(self._latents[row, slot], self._actions[row, slot])
+        counts = (self._taken > 0) & (error.norm(dim=-1) > self._least)
+        self._errors[row, slot] = torch.where(counts.unsqueeze(-1), error, 0)
+        self._known[row, slot] = counts.float()
 
     def acted(self, latents: Tensor, actions: Tensor) -> None:
         """The actions [B, A] in [-1, 1] that are taken from latents [B, D] now."""
@@ -62,9 +63,8 @@ class Residuals:
             self._latents = latents.new_zeros(len(latents), self.size, latents.shape[1])
             self._errors = torch.zeros_like(self._latents)
             self._actions = actions.new_zeros(len(actions), self.size, actions.shape[1])
-        slot = self._taken % self.size
-        self._latents[:, slot], self._actions[:, slot], self._known[:, slot] = latents, actions, 0
-        self._acted[:] = True
+        row, slot = torch.arange(len(latents), device=latents.device), self._taken % self.size
+        self._latents[row, slot], self._actions[row, slot], self._known[row, slot] = latents, actions, 0
         self._taken += 1
 
     def step(self, latents: Tensor, actions: Tensor) -> Tensor:
