@@ -265,3 +265,14 @@ def test_records_of_another_config_are_refused_or_moved_aside() -> None:
     assert table()._prepare(job, 1) == job.command
     fill(RANDOM, [True] * 5)
     assert table()._prepare(job, 1) is None, "done in the meantime"
+
+
+def test_the_time_of_a_job_with_one_thread_is_the_work_that_it_did(tmp_path):
+    busy = "import time\nwhile time.process_time() < 0.3: pass\ntime.sleep(0.4)"
+    alone, pair = Child((), tmp_path / "one.log", 1, busy), Child((), tmp_path / "two.log", 2, busy)
+    for child in (pair, alone):
+        while child.poll() is None:
+            time.sleep(0.01)
+        child.end()
+    assert 0.3 <= alone.work_seconds < 0.65
+    assert pair.work_seconds >= 0.7

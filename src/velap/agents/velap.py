@@ -55,7 +55,7 @@ class VelapAgent:
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
         self._device = next(model.parameters()).device
         self._residuals: Residuals | None = None
-        if config.controller.residuals and config.controller.lookahead:
+        if config.controller.residuals:
             self._residuals = Residuals(config.controller.residuals, self._fns.step, self._fns.step_distance)
         self._generators: list[torch.Generator] = []
         self._plan_age = torch.empty(0, dtype=torch.long)

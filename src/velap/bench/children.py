@@ -8,12 +8,13 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 CODE = ("import sys; from velap.bench.children import follow_parent; follow_parent(); from velap.cli import main; "
@@ -53,6 +54,7 @@ class Child:
                  keep_open: Sequence[int] = ()) -> None:
         """Start `velap command` with so many threads; what it prints goes to `log`, it holds the descriptors `keep_open`."""
         self.log = log
+        self._threads, self._processor_seconds = threads, 0.0
         log.parent.mkdir(parents=True, exist_ok=True)
         count = str(threads)
         environment = {**os.environ, "OMP_NUM_THREADS": count, "OPENBLAS_NUM_THREADS": count, "MKL_NUM_THREADS": count,
@@ -71,13 +73,28 @@ class Child:
         return time.monotonic() - self._began
 
     @property
+    def work_seconds(self) -> float:
+        """What it took once it has ended: processor time with one thread, so that neither a pause nor a neighbour of the
+        machine counts; with several, which spin while they wait for each other, the time since the start [s]."""
+        return self._processor_seconds if self._threads == 1 else self.seconds
+
+    @property
     def pid(self) -> int:
         """Its process."""
         return self._process.pid
 
     def poll(self) -> int | None:
         """The exit code, None while it runs."""
-        return self._process.poll()
+        with self._reaping():
+            return self._process.poll()
+
+    @contextlib.contextmanager
+    def _reaping(self) -> Iterator[None]:
+        """Counts the processor time of the process if it is waited for inside: the kernel then adds it to its parent's."""
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        yield
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        self._processor_seconds += after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
     def stop(self) -> None:
         """Tell it to save and end; `end` waits for that."""
@@ -86,11 +103,12 @@ class Child:
 
     def end(self) -> None:
         """Wait for its end, and force it after the grace time."""
-        try:
-            self._process.wait(GRACE_SECONDS)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        with self._reaping():
+            try:
+                self._process.wait(GRACE_SECONDS)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
         assert self._process.stdin is not None
         self._process.stdin.close()
 

@@ -65,7 +65,7 @@ class Runner:
     look: Callable[[Job], Finding]
     """What is there of a job now."""
     record: Callable[[Job, float, int], None]
-    """Told (job, seconds, units of work) of every sitting."""
+    """Told (job, seconds of work, units of work) of every sitting."""
     observer: Observer
     places: int
     """Jobs at once."""
@@ -121,7 +121,7 @@ class Runner:
             return
         seconds = child.seconds
         child.end()
-        self._note(running.pop(name), seconds)
+        self._note(running.pop(name))
         if code == 0 and self.look(job).finished:
             self._succeed(job, seconds, schedule, outcome)
         else:
@@ -141,10 +141,10 @@ class Runner:
             outcome.skipped.append(skipped.name)
             self.observer.skipped(skipped, job)
 
-    def _note(self, ended: _Running, seconds: float) -> None:
+    def _note(self, ended: _Running) -> None:
         """Record what a sitting did; what cannot be read any more did nothing."""
         with contextlib.suppress(VelapError):
-            self.record(ended.job, seconds, self.look(ended.job).done - ended.before)
+            self.record(ended.job, ended.child.work_seconds, self.look(ended.job).done - ended.before)
 
     def _stop(self, running: dict[str, _Running]) -> None:
         """End whatever still runs."""
@@ -152,7 +152,7 @@ class Runner:
             entry.child.stop()
         for entry in running.values():
             entry.child.end()
-            self._note(entry, entry.child.seconds)
+            self._note(entry)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ class Timing:
     job: str
     """Name of the job."""
     seconds: float
-    """Wall-clock time of its processes, start-up included [s]."""
+    """Time of its processes, start-up included [s]: processor time with one thread, else wall-clock time."""
     units: int
     """Work done in that time."""
     unit: str
