@@ -96,6 +96,19 @@ def test_waypoints_are_passed_when_reached_several_at_once() -> None:
     assert agent.waypoints_ahead(0).tolist() == [[-4.0, 9.0]], "the last waypoint stays"
 
 
+def test_a_shortcut_leads_to_the_farthest_waypoint_in_reach() -> None:
+    agent = VelapAgent(ToyModel(), override(toy_config(n_iter=20), controller={"shortcut_exponent": 6.0}))
+    agent.reset(np.ones(1, bool), np.array([0]))
+    agent.act(frames_at(START))
+    with torch.inference_mode():
+        # from (-6, 0): 9 steps to the first waypoint, 4 to the second, 5 to the third, 7 to the last
+        set_plan(agent, [START, (-6.0, 9.0), (-6.0, 4.0), (-1.0, 0.0), (1.0, 0.0)])
+    agent.act(frames_at((-6.0, 0.0)))
+    assert agent.waypoints_ahead(0).tolist() == [[-1.0, 0.0], [1.0, 0.0]]
+    agent.act(frames_at((-6.0, -9.0)))
+    assert agent.waypoints_ahead(0).tolist() == [[-1.0, 0.0], [1.0, 0.0]], "nothing in reach: no way back either"
+
+
 @pytest.mark.parametrize(("lookahead", "gets_there"), [(0, False), (3, True)])
 def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: int, gets_there: bool) -> None:
     model = ToyModel()

@@ -111,6 +111,9 @@ class TrainConfig:
     reconstruction: float = 0.0
     """Weight of the reconstruction loss of the joint phase; 0 has none. ours: Eq. 2 asks the latent only for what a step or
     a value depends on here and now, and far parts of a scene may go missing; the paper does without."""
+    reconstruction_side: int = 16
+    """Side of the shrunk frames that are reconstructed [px]. ours: what the far end of a scene looks like, or where exactly
+    a handle is."""
     c2: float = 0.001
     """Weight of imitation in the local policy, Eq. 5, Table 7."""
     c3: float = 0.001
@@ -187,6 +190,7 @@ class TrainConfig:
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
         for name in ("c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
+        _require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
         _require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
         _require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
         _require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
@@ -290,12 +294,16 @@ class ControllerConfig:
     by π^l alone [steps]. ours: π^l pushes into walls at corners that h knows of; 0 in `paper`."""
     lookahead_samples: int = 32
     """Actions drawn from g for the lookahead. ours."""
+    shortcut_exponent: float = 0.0
+    """On to the farthest waypoint with Q_min above γ^this, whatever lies between; 0 takes each in turn. ours: trees in open
+    space zigzag, but a shortcut may cut corners."""
     residuals: int = 0
     """Last steps of the episode whose prediction errors correct h in lookahead and plans; 0 trusts h [steps]. ours."""
 
     def __post_init__(self) -> None:
         _require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")
         _require(self.residuals >= 0, "residuals", self.residuals, "0 or more steps")
+        _require(self.shortcut_exponent >= 0, "shortcut_exponent", self.shortcut_exponent, "0 or more")
         _require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
         _require(self.lookahead_samples >= 1, "lookahead_samples", self.lookahead_samples, "at least 1 action")
 
@@ -377,8 +385,8 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction", "shift"),
-    "controller": ("residuals",),
+    "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction", "reconstruction_side", "shift"),
+    "controller": ("residuals", "shortcut_exponent"),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 

@@ -53,6 +53,8 @@ class VelapAgent:
         self._lookahead, self._samples = config.controller.lookahead, config.controller.lookahead_samples
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
+        shortcut = config.controller.shortcut_exponent
+        self._shortcut_value = q_from_steps(shortcut, self._fns.discount) if shortcut > 0 else None
         self._device = next(model.parameters()).device
         self._residuals: Residuals | None = None
         if config.controller.residuals:
@@ -180,6 +182,19 @@ class VelapAgent:
             rows = rows[q_min > self._reached_value]
             self._current[rows] += 1
             rows = rows[self._current[rows] < self._length[rows] - 1]
+        if self._shortcut_value is not None:
+            self._cut_short(latents, self._shortcut_value)
+
+    def _cut_short(self, latents: Tensor, threshold: float) -> None:
+        """On to the farthest waypoint ahead with Q_min(z_curr, z_wp) > threshold, where there is one (ours)."""
+        number = torch.arange(self._waypoints.shape[1], device=latents.device)
+        ahead = (number > self._current.unsqueeze(1)) & (number < self._length.unsqueeze(1))
+        row, waypoint = ahead.nonzero(as_tuple=True)
+        if len(row) == 0:
+            return
+        q_min, _ = self._fns.reach(latents[row], self._waypoints[row, waypoint])
+        near = q_min > threshold
+        self._current.scatter_reduce_(0, row[near], waypoint[near], "amax")
 
     def waypoints_ahead(self, row: int) -> Tensor:
         """[L', D] waypoints of `row` that are still ahead, the current one first; empty before the first plan."""

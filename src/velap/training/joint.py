@@ -88,15 +88,17 @@ def shifted(stacks: Tensor, group: int, offsets: Tensor) -> Tensor:
 class FrameDecoder(MLP):
     """Latents → the newest frame of the stack, shrunk (ours). It learns beside the encoder and is thrown away."""
 
-    SIDE = 16
-    """Side of the shrunk frames [px]."""
     FRAMES = 160
     """Frames a batch that are decoded: more cost more than they teach."""
+    WIDTH = 16
+    """Hidden units for each pixel of the side."""
 
-    def __init__(self, model: LatentModel, sampler: WindowSampler, generator: torch.Generator) -> None:
+    def __init__(self, model: LatentModel, side: int, sampler: WindowSampler, generator: torch.Generator) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(generator.initial_seed())
-            super().__init__(model.config.latent_dim, (256,), 3 * self.SIDE**2, "layer")
+            super().__init__(model.config.latent_dim, (self.WIDTH * side,), 3 * side**2, "layer")
+        self.side = side
+        """Of the shrunk frames [px]."""
         self.to(sampler.device)
         step = max(len(sampler.frames) // 2048, 1)
         sample = self.shrink(sampler.stacks(torch.arange(0, len(sampler.frames), step, device=sampler.device)))
@@ -106,9 +108,9 @@ class FrameDecoder(MLP):
         """float32 [], of the data from it."""
 
     def shrink(self, stacks: Tensor) -> Tensor:
-        """uint8 [M, N, H, W, 3] → the newest frames, float32 [M, 3 · SIDE²] in [0, 1]."""
+        """uint8 [M, N, H, W, 3] → the newest frames, float32 [M, 3 · side²] in [0, 1]."""
         newest = stacks[:, -1].permute(0, 3, 1, 2).float() / 255
-        return nn.functional.adaptive_avg_pool2d(newest, self.SIDE).flatten(1)
+        return nn.functional.adaptive_avg_pool2d(newest, self.side).flatten(1)
 
     def loss(self, latents: Tensor, stacks: Tensor, generator: torch.Generator) -> tuple[Tensor, Info]:
         """Reconstruction loss of some of the frames. latents [M, D]; stacks uint8 [M, N, H, W, 3]."""
@@ -123,7 +125,9 @@ class JointLearner:
         self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
         self.local_target = copy.deepcopy(model.local_critics).requires_grad_(False).eval()
         self.global_target = copy.deepcopy(model.global_critic).requires_grad_(False).eval()
-        self.decoder = FrameDecoder(model, sampler, generator) if config.reconstruction > 0 else None
+        self.decoder = None
+        if config.reconstruction > 0:
+            self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
         self.cache: Tensor | None = None
         self.updates = 0
         self._optimise(config.learning_rate, encoder=True)
