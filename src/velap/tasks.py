@@ -65,7 +65,7 @@ class Task:
 
 
 _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
-    "train": {"c1": 0.02, "c3": 0.1, "latent_horizon": 15},
+    "train": {"c1": 0.02, "rewarded_share": 0.0, "group_reach": 8, "reconstruction": 0.0, "latent_horizon": 20},
     "planner": {
         "n_iter": 500,
         "discard_low_exponent": 20.0,
@@ -75,9 +75,16 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "expansion_weight": 1.0,
         "anchor": "none",
     },
-    "controller": {"n_replan": 8},
+    "controller": {
+        "n_replan": 15,
+        "stop_exponent": 35.0,
+        "waypoint_exponent": 3.0,
+        "shortcut_exponent": 12.0,
+        "residuals": 0,
+    },
 }
-"""ours: the manipulation tasks plan like SpiralMaze does by default."""
+"""ours: the manipulation tasks plan like SpiralMaze does by default; π^g, which has seen experts near the goal, takes over
+earlier."""
 
 TASKS: dict[str, Task] = {
     task.name: task
