@@ -211,6 +211,16 @@ def test_a_dry_run_says_what_is_there_and_leaves_everything_alone() -> None:
     assert not Path("docs").exists() and not Path("runs").exists()
 
 
+def test_a_head_is_expected_to_take_as_long_as_its_data() -> None:
+    def updates(text: str) -> int:
+        return inventory().head(Cell(*text.split(), "default", 0)).total
+
+    assert updates("SpiralMaze bc") == -(-100 * 20_000 // 256)
+    assert updates("ObstacleMaze bc") == 20_000, "its hundred passes are more"
+    assert 50 < updates("SpiralMaze bc-success") < updates("ObstacleMaze bc-success") < 1_000
+    assert updates("SpiralMaze iql") == 15_000
+
+
 def test_a_run_of_another_config_is_no_joint_checkpoint() -> None:
     folder = checkpoint_path("SpiralMaze", "default", 0).parent
     folder.mkdir(parents=True)

@@ -40,6 +40,11 @@ class Recipe:
     expert_noise: float = 0.3
     """Standard deviation of the Gaussian noise on a noisy expert's actions. ours: the paper gives no number."""
 
+    @property
+    def transitions(self) -> int:
+        """Transitions of the dataset where no trajectory ends early."""
+        return self.contexts * self.trajectories * self.max_steps
+
 
 @dataclass(frozen=True)
 class Task:
@@ -75,13 +80,7 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "expansion_weight": 1.0,
         "anchor": "none",
     },
-    "controller": {
-        "n_replan": 15,
-        "stop_exponent": 35.0,
-        "waypoint_exponent": 3.0,
-        "shortcut_exponent": 12.0,
-        "residuals": 0,
-    },
+    "controller": {**ONE_SCENE["controller"], "stop_exponent": 35.0, "shortcut_exponent": 12.0},
 }
 """ours: the manipulation tasks plan like SpiralMaze does by default; π^g, which has seen experts near the goal, takes over
 earlier."""

@@ -105,13 +105,13 @@ class Inventory:
     def head(self, cell: Cell) -> Finding:
         """The head of a cell: learnt on the latents of the joint checkpoint that is there, with the settings of today."""
         joint = joint_metadata(cell.task, cell.preset, cell.seed)
-        path, total = self.head_path(cell), learner_config(cell.method, cell.preset).steps
+        path, total = self.head_path(cell), _expected_updates(cell)
         head = checkpoint_metadata(path)
         wanted = {"method": cell.method, "head_config": head_settings(cell)}
         fits = (joint is not None and head is not None and head.get("joint") == joint.get(WEIGHTS_SHA256)
                 and all(head.get(name) == value for name, value in wanted.items()))
         if fits and head is not None:
-            return Finding(total, total, "updates", True, seconds=_seconds(head))
+            return Finding(int(head["steps"]), int(head["steps"]), "updates", True, seconds=_seconds(head))
         begun = _last_step(path.with_suffix(".metrics.jsonl")) if path.with_suffix(".state.safetensors").exists() else 0
         return Finding(min(begun, total), total, "updates", False)
 
@@ -265,6 +265,15 @@ def difference(saved: Config, config: Config) -> str:
             if there[name] != here[name]:
                 return f"{part}.{name} is {there[name]!r} there and {here[name]!r} today"
     return "no field"
+
+
+def _expected_updates(cell: Cell) -> int:
+    """Updates that the cell's head should take by the recipe of its dataset [steps]; BC(D*) sees the way to each reward."""
+    recipe = get_task(cell.task).recipe
+    transitions = recipe.transitions
+    if cell.method == "bc-success":
+        transitions = round(transitions * recipe.success_percent / 100 * recipe.max_steps / 2)
+    return learner_config(cell.method, cell.preset).length(transitions)
 
 
 def _recipe_defaults() -> dict[str, Any]:

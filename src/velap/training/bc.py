@@ -29,6 +29,11 @@ class BCConfig(LearnerConfig):
         super().__post_init__()
         self.require("passes", self.passes >= 0, "0 or more passes")
 
+    def length(self, transitions: int) -> int:
+        """Updates of a training on so many transitions, ended early by `passes` [steps]."""
+        enough = max(LEAST_STEPS, -(-self.passes * transitions // self.batch))
+        return min(self.steps, enough) if self.passes else self.steps
+
 
 PAPER_BC = BCConfig(steps=300_000, batch=128, learning_rate=3e-4, cosine=False, passes=0)
 """D.1."""
@@ -43,13 +48,6 @@ def cloning_error(action: Tensor, data_action: Tensor) -> Tensor:
 
 class BCLearner(FrozenLearner[BCConfig, PolicyHead]):
     """π(z) → a by mean-squared error."""
-
-    @property
-    def total(self) -> int:
-        """Updates, ended early by `passes` [steps]."""
-        steps, passes = self.config.steps, self.config.passes
-        enough = max(LEAST_STEPS, -(-passes * len(self.pool) // self.config.batch))
-        return min(steps, enough) if passes else steps
 
     def loss(self, rows: Tensor) -> tuple[Tensor, Info]:
         """Mean squared error of the predicted actions, D.1."""

@@ -57,6 +57,10 @@ class LearnerConfig:
             raise ConfigError(f"{type(self).__name__} field `{name}` is {getattr(self, name)!r}; expected {expected}. "
                               "Change that field and start again.")
 
+    def length(self, transitions: int) -> int:
+        """Updates of a training on so many transitions [steps]."""
+        return self.steps
+
     def to_json(self) -> str:
         """Canonical JSON of all fields."""
         return json.dumps(asdict(self), sort_keys=True)
@@ -162,7 +166,7 @@ class FrozenLearner(ABC, Generic[ConfigT, HeadT]):
     @property
     def total(self) -> int:
         """Updates of the whole training [steps]."""
-        return self.config.steps
+        return self.config.length(len(self.pool))
 
     @abstractmethod
     def loss(self, rows: Tensor) -> tuple[Tensor, Info]:
