@@ -206,6 +206,53 @@ def test_a_decoded_scene_is_learnt(tmp_path):
     assert np.mean(losses[-5:]) < np.mean(losses[:5])
 
 
+def test_the_encoder_phase_moves_the_encoder_alone_and_the_others_follow(tmp_path):
+    run = trainer(tmp_path, encoder_steps=2, joint_steps=2, latent_steps=1)
+    before = {name: value.clone() for name, value in run.model.state_dict().items()}
+    phases, losses = [], []
+    for _ in range(run.total):
+        losses.append(set(run.update()))
+        phases.append(run.phase)
+        if len(phases) == 2:
+            changed = {name for name, value in run.model.state_dict().items() if not torch.equal(value, before[name])}
+            assert changed and all(name.startswith("encoder.") for name in changed)
+    assert phases == ["encoder", "encoder", "joint", "joint", "latent"]
+    assert losses[1] == {"encoder/displacement", "encoder/reconstruction"} and "local/loss" in losses[2] & losses[4]
+    assert run.model.state_dict().keys() == before.keys(), "what taught the encoder is thrown away"
+    plain = trainer(tmp_path / "plain")
+    for a, b in zip(plain.model.parameters(), trainer(tmp_path / "b", encoder_steps=2).model.parameters(), strict=True):
+        assert torch.equal(a, b), "the phase must not touch the model's first weights"
+
+
+def test_pairs_lie_in_one_training_episode_and_know_their_actions(tmp_path):
+    run = trainer(tmp_path, encoder_steps=1, encoder_pairs=500, encoder_reach=3)
+    sampler, pairs = run.sampler, run.learner.pairs
+    now, then = pairs.draw(run.generator)
+    assert torch.equal(sampler.first[now], sampler.first[then])
+    assert set((then - now).tolist()) == {1, 2, 3}
+    held_out = run.store.episode_start[run.holdout][0]
+    assert not torch.isin(sampler.first[now], torch.tensor([held_out])).any()
+    for a, b, total in zip(now[:20].tolist(), then[:20].tolist(), (pairs.before[then] - pairs.before[now])[:20], strict=True):
+        assert torch.allclose(sampler.actions[a:b].sum(0).double(), total, atol=1e-6)
+
+
+def test_pairs_teach_where_the_agent_went(tmp_path):
+    """Frames that show a dot at the sum of all actions: the error of the summed actions falls."""
+    store = make_store(episodes=40)
+    place = np.zeros((len(store.frames), 2), int)
+    for start, length in zip(store.episode_start, store.episode_length, strict=True):
+        place[start : start + length + 1] = 8
+        walked = np.cumsum(store.actions[start : start + length, :2] * 0.8, 0)
+        place[start + 1 : start + length + 1] = (8 + walked).round().clip(1, 14)
+    store.frames[:] = 0
+    for row, (x, y) in enumerate(place):
+        store.frames[row, y - 1 : y + 2, x - 1 : x + 2] = 255
+    settings = config(encoder_steps=150, encoder_learning_rate=3e-3)
+    run = Trainer(settings, store, tmp_path, 0, torch.device("cpu"))
+    errors = [float(run.update()["encoder/displacement"]) for _ in range(150)]
+    assert np.mean(errors[-20:]) < 0.75 * np.mean(errors[:10])
+
+
 def test_frames_are_shifted_group_by_group():
     stacks = torch.arange(3 * 4 * 5).view(3, 1, 4, 5, 1).to(torch.uint8).expand(3, 2, 4, 5, 3)
     moved = shifted(stacks, 2, torch.tensor([[1, 0], [0, -2]]))
@@ -254,16 +301,16 @@ def test_an_annealed_run_cannot_be_resumed_with_another_length(tmp_path):
 
 
 @pytest.mark.parametrize("norm", ["layer", "batch"])
-@pytest.mark.parametrize("stop", [2, 6, 10])
-def test_resume_goes_on_to_the_same_bits(tmp_path, norm, stop):
-    straight = trainer(tmp_path / "a", norm, reconstruction=0.5)
-    broken = trainer(tmp_path / "b", norm, reconstruction=0.5)
+@pytest.mark.parametrize(("encoder", "stop"), [(0, 2), (0, 6), (0, 10), (3, 2), (3, 4)])
+def test_resume_goes_on_to_the_same_bits(tmp_path, norm, encoder, stop):
+    straight = trainer(tmp_path / "a", norm, reconstruction=0.5, encoder_steps=encoder)
+    broken = trainer(tmp_path / "b", norm, reconstruction=0.5, encoder_steps=encoder)
     for _ in range(12):
         straight.update()
     for _ in range(stop):
         broken.update()
     broken.save()
-    again = trainer(tmp_path / "b", norm, reconstruction=0.5)
+    again = trainer(tmp_path / "b", norm, reconstruction=0.5, encoder_steps=encoder)
     again.resume()
     for _ in range(12 - stop):
         again.update()

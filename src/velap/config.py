@@ -83,6 +83,17 @@ class ModelConfig:
 class TrainConfig:
     """Joint training (Eq. 2-5, 9; Table 7; App. B.4, B.5) and the latent phase (ours)."""
 
+    encoder_steps: int = 0
+    """Updates of the encoder alone before the joint phase, on pairs of states; 0 has none [steps]. ours: the losses of Eq. 2
+    leave out where exactly a hand or a handle is."""
+    encoder_pairs: int = 64
+    """Pairs a batch of the encoder phase, drawn from all over the data. ours."""
+    encoder_reach: int = 20
+    """Most steps between the two states of a pair [steps]. ours."""
+    encoder_learning_rate: float = 1e-3
+    """Peak learning rate of the encoder phase, cosine to a hundredth. ours."""
+    inverse: float = 0.3
+    """Weight of the summed actions between two states beside the reconstruction of both, in the encoder phase. ours."""
     joint_steps: int = 4_000
     """Model updates of the joint phase [steps]. ours: the paper gives no number."""
     batch_windows: int = 24
@@ -170,9 +181,11 @@ class TrainConfig:
     """Model updates between checkpoints [steps]. ours."""
 
     def __post_init__(self) -> None:
-        for name in ("joint_steps", "latent_steps", "value_transitions", "dynamics_rollouts"):
+        for name in ("encoder_steps", "joint_steps", "latent_steps", "value_transitions", "dynamics_rollouts"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in (
+            "encoder_pairs",
+            "encoder_reach",
             "batch_windows",
             "window",
             "dynamics_horizon",
@@ -186,9 +199,9 @@ class TrainConfig:
             "checkpoint_every",
         ):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        for name in ("learning_rate", "latent_learning_rate", "temperature"):
+        for name in ("encoder_learning_rate", "learning_rate", "latent_learning_rate", "temperature"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        for name in ("c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
+        for name in ("inverse", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         _require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
         _require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
@@ -215,6 +228,12 @@ class TrainConfig:
             f"at least dynamics_horizon = {self.dynamics_horizon} steps",
         )
         _require(self.precision in get_args(Precision), "precision", self.precision, f"one of {get_args(Precision)}")
+
+
+    @property
+    def steps(self) -> int:
+        """Updates of all phases [steps]."""
+        return self.encoder_steps + self.joint_steps + self.latent_steps
 
 
 @dataclass(frozen=True)
@@ -385,7 +404,20 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "train": ("group_windows", "group_reach", "group_goals", "anneal", "reconstruction", "reconstruction_side", "shift"),
+    "train": (
+        "encoder_steps",
+        "encoder_pairs",
+        "encoder_reach",
+        "encoder_learning_rate",
+        "inverse",
+        "group_windows",
+        "group_reach",
+        "group_goals",
+        "anneal",
+        "reconstruction",
+        "reconstruction_side",
+        "shift",
+    ),
     "controller": ("residuals", "shortcut_exponent"),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""

@@ -116,7 +116,9 @@ def calibrated(job: Job) -> float:
         frames = train.batch_windows * (train.window + 1)
         per_update = frames * FRAME_SECONDS.get(config.model.frame_stack, FRAME_SECONDS[3])
         per_update *= 1.0 if train.whole_windows else SINGLE_FACTOR
-        return START_SECONDS + train.joint_steps * per_update + train.latent_steps * LATENT_UPDATE_SECONDS
+        encoder = 2 * train.encoder_pairs * FRAME_SECONDS.get(config.model.frame_stack, FRAME_SECONDS[3])
+        joint = train.encoder_steps * encoder + train.joint_steps * per_update
+        return START_SECONDS + joint + train.latent_steps * LATENT_UPDATE_SECONDS
     if job.kind == "head":
         loading = task.recipe.transitions * FRAME_LOAD_SECONDS
         return START_SECONDS + loading + job.finding.total * HEAD_UPDATE_SECONDS[job.cell.method]

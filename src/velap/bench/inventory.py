@@ -93,7 +93,7 @@ class Inventory:
     def joint(self, task: str, preset: str, seed: int) -> Finding:
         """The joint checkpoint of a run: trained to its end, by the config of today, on the dataset that is there."""
         config, folder = make_config(task, preset), checkpoint_path(task, preset, seed).parent
-        total = config.train.joint_steps + config.train.latent_steps
+        total = config.train.steps
         metadata = joint_metadata(task, preset, seed)
         if metadata is None:
             return _unfinished_joint(folder, config, total)

@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from velap.config import TrainConfig
 from velap.data.windows import Batch, WindowSampler
 from velap.models.latent import LatentModel
-from velap.models.networks import MLP
 from velap.threads import one_thread
 from velap.training.losses import (
     Info,
@@ -27,11 +26,11 @@ from velap.training.losses import (
     infonce_loss,
     policy_loss,
     polyak,
-    reconstruction_loss,
     reparameterise,
     rollout_mse_loss,
     td_target,
 )
+from velap.training.pairs import FrameDecoder, PairObjective
 
 TRANSITIONS_A_THREAD = 512
 """Transitions of a batch up to which the heads work on one thread of a CPU. ours."""
@@ -85,41 +84,9 @@ def shifted(stacks: Tensor, group: int, offsets: Tensor) -> Tensor:
     return moved
 
 
-class FrameDecoder(MLP):
-    """Latents → the newest frame of the stack, shrunk (ours). It learns beside the encoder and is thrown away."""
-
-    FRAMES = 160
-    """Frames a batch that are decoded: more cost more than they teach."""
-    WIDTH = 16
-    """Hidden units for each pixel of the side."""
-
-    def __init__(self, model: LatentModel, side: int, sampler: WindowSampler, generator: torch.Generator) -> None:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(generator.initial_seed())
-            super().__init__(model.config.latent_dim, (self.WIDTH * side,), 3 * side**2, "layer")
-        self.side = side
-        """Of the shrunk frames [px]."""
-        self.to(sampler.device)
-        step = max(len(sampler.frames) // 2048, 1)
-        sample = self.shrink(sampler.stacks(torch.arange(0, len(sampler.frames), step, device=sampler.device)))
-        self.mean = sample.mean(0)
-        """float32 [C], mean frame of the data."""
-        self.deviation = (sample - self.mean).square().mean().sqrt().clamp(min=1e-3)
-        """float32 [], of the data from it."""
-
-    def shrink(self, stacks: Tensor) -> Tensor:
-        """uint8 [M, N, H, W, 3] → the newest frames, float32 [M, 3 · side²] in [0, 1]."""
-        newest = stacks[:, -1].permute(0, 3, 1, 2).float() / 255
-        return nn.functional.adaptive_avg_pool2d(newest, self.side).flatten(1)
-
-    def loss(self, latents: Tensor, stacks: Tensor, generator: torch.Generator) -> tuple[Tensor, Info]:
-        """Reconstruction loss of some of the frames. latents [M, D]; stacks uint8 [M, N, H, W, 3]."""
-        chosen = torch.randperm(len(latents), generator=generator, device=latents.device)[: self.FRAMES]
-        return reconstruction_loss(self(latents[chosen]), self.shrink(stacks[chosen]), self.mean, self.deviation)
-
-
 class JointLearner:
-    """Owns the model, its target critics and the optimisers; `joint_step` and `latent_step` are single updates."""
+    """Owns the model, its target critics and the optimisers; `encoder_step`, `joint_step` and `latent_step` are single
+    updates."""
 
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
@@ -128,9 +95,14 @@ class JointLearner:
         self.decoder = None
         if config.reconstruction > 0:
             self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
+        self.pairs = PairObjective(model, config, sampler, generator) if config.encoder_steps > 0 else None
         self.cache: Tensor | None = None
         self.updates = 0
         self._optimise(config.learning_rate, encoder=True)
+        self.pair_optimizer = None
+        if self.pairs is not None:
+            learnt = [*model.encoder.parameters(), *self.pairs.parameters()]
+            self.pair_optimizer = torch.optim.Adam(learnt, config.encoder_learning_rate, fused=True)
         targets = (self.local_target, self.global_target)
         sources = (model.local_critics, model.global_critic)
         self._target_pairs = (
@@ -142,14 +114,16 @@ class JointLearner:
 
     @property
     def companions(self) -> dict[str, nn.Module]:
-        """Target critics by name, and the decoder."""
-        decoder = {"decoder": self.decoder} if self.decoder is not None else {}
-        return {"local": self.local_target, "global": self.global_target, **decoder}
+        """Target critics by name, and what is thrown away in the end."""
+        extra = {"decoder": self.decoder, "pairs": self.pairs}
+        kept = {name: module for name, module in extra.items() if module is not None}
+        return {"local": self.local_target, "global": self.global_target, **kept}
 
     @property
     def optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Optimisers by name."""
-        return {"model": self.model_optimizer, "policy": self.policy_optimizer}
+        pairs = {"pairs": self.pair_optimizer} if self.pair_optimizer is not None else {}
+        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **pairs}
 
     def _optimise(self, learning_rate: float, encoder: bool) -> None:
         """Fresh optimisers; the encoder is left out in the latent phase."""
@@ -162,6 +136,15 @@ class JointLearner:
         self.policy_parameters = [p for part in acting for p in part.parameters()]
         self.model_optimizer = torch.optim.Adam(self.model_parameters, learning_rate, fused=True)
         self.policy_optimizer = torch.optim.Adam(self.policy_parameters, learning_rate, fused=True)
+
+    def encoder_step(self) -> Info:
+        """One update of the encoder alone, on pairs of states (ours)."""
+        assert self.pairs is not None and self.pair_optimizer is not None, "encoder_steps is 0"
+        self.pair_optimizer.zero_grad(set_to_none=True)
+        loss, info = self.pairs.loss(self.model, self.generator)
+        loss.backward()
+        self.pair_optimizer.step()
+        return info
 
     def joint_step(self) -> Info:
         """One update of Eq. 2, then one of Eq. 5 and of g."""

@@ -71,13 +71,16 @@ class Trainer:
 
     @property
     def total(self) -> int:
-        """Updates of both phases [steps]."""
-        return self.config.train.joint_steps + self.config.train.latent_steps
+        """Updates of all phases [steps]."""
+        return self.config.train.steps
 
     @property
     def phase(self) -> str:
-        """`joint` or `latent`."""
-        return "joint" if self.step <= self.config.train.joint_steps else "latent"
+        """`encoder`, `joint` or `latent`."""
+        train = self.config.train
+        if self.step <= train.encoder_steps:
+            return "encoder"
+        return "joint" if self.step <= train.encoder_steps + train.joint_steps else "latent"
 
     @property
     def cadence(self) -> Cadence:
@@ -105,17 +108,20 @@ class Trainer:
 
     def update(self) -> dict[str, Tensor]:
         """One update of the current phase."""
-        train = self.config.train
-        if self.step < train.joint_steps:
-            if train.anneal:
-                self.learner.set_learning_rate(train.learning_rate * cosine(self.step / train.joint_steps))
-            info = self.learner.joint_step()
+        train, learner = self.config.train, self.learner
+        joint, latent = train.encoder_steps, train.encoder_steps + train.joint_steps
+        if self.step < joint:
+            learner.set_learning_rate(train.encoder_learning_rate * cosine(self.step / joint))
+            info = learner.encoder_step()
+        elif self.step < latent:
+            rate = cosine((self.step - joint) / train.joint_steps) if train.anneal else 1.0
+            learner.set_learning_rate(train.learning_rate * rate)
+            info = learner.joint_step()
         else:
-            if self.learner.cache is None:
-                self.learner.begin_latent_phase()
-            done = (self.step - train.joint_steps) / max(train.latent_steps, 1)
-            self.learner.set_learning_rate(train.latent_learning_rate * cosine(done))
-            info = self.learner.latent_step()
+            if learner.cache is None:
+                learner.begin_latent_phase()
+            learner.set_learning_rate(train.latent_learning_rate * cosine((self.step - latent) / max(train.latent_steps, 1)))
+            info = learner.latent_step()
         self.step += 1
         return info
 

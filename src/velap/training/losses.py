@@ -92,6 +92,16 @@ def polyak(targets: Sequence[Tensor], sources: Sequence[Tensor], rate: float) ->
     torch._foreach_lerp_(list(targets), list(sources), rate)
 
 
+def displacement_loss(predicted: Tensor, actions: Tensor) -> tuple[Tensor, Info]:
+    """Smooth L1 error of the summed actions between two states [P, A], ours after multi-step inverse models (AC-State).
+
+    A sum says where the agent went, the first action alone little; where it was held up the sum is wrong by a lot, hence no
+    square.
+    """
+    loss = torch.nn.functional.smooth_l1_loss(predicted, actions)
+    return loss, {"error": (predicted - actions).detach().abs().mean()}
+
+
 def reconstruction_loss(decoded: Tensor, frames: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Info]:
     """Mean-squared error of the decoded frames in deviations of the data, ours: 1 is what the mean frame would have.
 
