@@ -232,7 +232,8 @@ def test_pairs_lie_in_one_training_episode_and_know_their_actions(tmp_path):
     assert set((then - now).tolist()) == {1, 2, 3}
     held_out = run.store.episode_start[run.holdout][0]
     assert not torch.isin(sampler.first[now], torch.tensor([held_out])).any()
-    for a, b, total in zip(now[:20].tolist(), then[:20].tolist(), (pairs.before[then] - pairs.before[now])[:20], strict=True):
+    sums = pairs.before[then] - pairs.before[now]
+    for a, b, total in zip(now[:20].tolist(), then[:20].tolist(), sums[:20], strict=True):
         assert torch.allclose(sampler.actions[a:b].sum(0).double(), total, atol=1e-6)
 
 
