@@ -36,10 +36,12 @@ PLAN_EVERY = {"mppi": 5, "mbop": 5, "iris": 5, "iris-multistep": 5}
 """Environment steps between two plans [steps], App. D.4 to D.7."""
 EXPANSION_STEP_SECONDS = 0.000012
 """VELAP's search, one simulated step of one expansion [s]."""
-CORRECTED_FACTOR = 2.5
+CORRECTED_FACTOR = 4.0
 """Plans along corrected dynamics (`residuals`), relative to those that native.c grows."""
 LOOKAHEAD_SECONDS = 0.0013
 """VELAP's lookahead at each environment step [s]."""
+CORRECTED_LOOKAHEAD_SECONDS = 0.045
+"""The same along corrected dynamics [s]."""
 FRAME_SECONDS = {1: 0.00046, 3: 0.00060}
 """Joint training on whole windows, one encoded state of so many frames with its share of the update [s]."""
 SINGLE_FACTOR = 1.5
@@ -144,5 +146,6 @@ def act_seconds(method: str, config: Config) -> float:
     plan = planner.n_iter * planner.n_sim * EXPANSION_STEP_SECONDS
     if controller.residuals:
         plan *= CORRECTED_FACTOR
-    lookahead = LOOKAHEAD_SECONDS if controller.lookahead else 0.0
+    simulated = CORRECTED_LOOKAHEAD_SECONDS if controller.residuals else LOOKAHEAD_SECONDS
+    lookahead = simulated if controller.lookahead else 0.0
     return ENCODE_SECONDS + lookahead + plan / controller.n_replan
