@@ -9,6 +9,7 @@ from torch import tensor
 from velap.training.losses import (
     action_model_loss,
     critic_loss,
+    displacement_loss,
     infonce_loss,
     policy_loss,
     polyak,
@@ -111,6 +112,12 @@ def test_polyak_moves_by_its_rate():
     target = [tensor([0.0])]
     polyak(target, [tensor([2.0])], 0.25)
     assert target[0].item() == 0.5
+
+
+def test_displacement_is_square_when_small_and_linear_when_large():
+    loss, info = displacement_loss(torch.tensor([[0.5, 3.0]]), torch.zeros(1, 2))
+    assert loss.item() == pytest.approx((0.5 * 0.5**2 + (3.0 - 0.5)) / 2)
+    assert info["error"].item() == pytest.approx(1.75)
 
 
 def test_reconstruction_is_one_for_the_mean_frame():

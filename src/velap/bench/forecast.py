@@ -115,12 +115,10 @@ def calibrated(job: Job) -> float:
         return START_SECONDS + task.recipe.transitions * _env_step(job.cell.task)
     if job.kind == "joint":
         train = config.train
-        frames = train.batch_windows * (train.window + 1)
-        per_update = frames * FRAME_SECONDS.get(config.model.frame_stack, FRAME_SECONDS[3])
-        per_update *= 1.0 if train.whole_windows else SINGLE_FACTOR
-        encoder = 2 * train.encoder_pairs * FRAME_SECONDS.get(config.model.frame_stack, FRAME_SECONDS[3])
-        joint = train.encoder_steps * encoder + train.joint_steps * per_update
-        return START_SECONDS + joint + train.latent_steps * LATENT_UPDATE_SECONDS
+        frame = FRAME_SECONDS.get(config.model.frame_stack, FRAME_SECONDS[3])
+        windows = train.batch_windows * (train.window + 1) * (1.0 if train.whole_windows else SINGLE_FACTOR)
+        encoded = train.encoder_steps * 2 * train.encoder_pairs + train.joint_steps * windows
+        return START_SECONDS + encoded * frame + train.latent_steps * LATENT_UPDATE_SECONDS
     if job.kind == "head":
         loading = task.recipe.transitions * FRAME_LOAD_SECONDS
         return START_SECONDS + loading + job.finding.total * HEAD_UPDATE_SECONDS[job.cell.method]

@@ -51,8 +51,8 @@ class FrameDecoder(MLP):
 class PairObjective(nn.Module):
     """Multi-step inverse dynamics and reconstruction of single frames, on pairs of states of one trajectory.
 
-    Windows of neighbouring scenes, which the joint phase needs, are few different pictures; pairs from all over the data
-    teach an encoder in a tenth of the frames. What it learns beside the encoder is thrown away.
+    Windows of neighbouring scenes, which the joint phase needs, are few different pictures; pairs come from all over the
+    data. What it learns beside the encoder is thrown away.
     """
 
     HIDDEN = (256, 256)
@@ -79,7 +79,7 @@ class PairObjective(nn.Module):
         return now, torch.minimum(now + ahead, sampler.last[now])
 
     def loss(self, model: LatentModel, generator: torch.Generator) -> tuple[Tensor, Info]:
-        """`inverse` times the error of the summed actions plus the reconstruction loss of all frames of a batch."""
+        """`inverse` times the error of the summed actions, plus the reconstruction loss of at most `FRAMES` frames."""
         now, then = self.draw(generator)
         stacks = self.sampler.stacks(torch.cat([now, then]))
         latents = model.encode(stacks)
