@@ -94,6 +94,8 @@ class TrainConfig:
     """Peak learning rate of the encoder phase, cosine to a hundredth. ours."""
     inverse: float = 0.3
     """Weight of the summed actions between two states beside the reconstruction of both, in the encoder phase. ours."""
+    joint_pairs: float = 0.0
+    """Weight of the encoder phase's objective in the joint phase, on pairs of its own; 0 has none. ours."""
     joint_steps: int = 4_000
     """Model updates of the joint phase [steps]. ours: the paper gives no number."""
     batch_windows: int = 24
@@ -165,6 +167,9 @@ class TrainConfig:
     """Windows a batch of the latent phase. ours."""
     latent_horizon: int = 5
     """Rollout length of the dynamics in the latent phase [steps]. ours."""
+    latent_rewarded_share: float | None = None
+    """`rewarded_share` of the latent phase; None takes that one. ours: an encoder has to see rewards to tell them apart, but
+    a share beyond chance makes states that look like rewarded ones too valuable."""
     latent_heads: bool = True
     """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
     holdout_episodes: int = 16
@@ -201,12 +206,15 @@ class TrainConfig:
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("encoder_learning_rate", "learning_rate", "latent_learning_rate", "temperature"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        for name in ("inverse", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
+        for name in ("inverse", "joint_pairs", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         _require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
         _require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
         _require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
         _require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
+        for name in ("rewarded_share", "latent_rewarded_share"):
+            share = getattr(self, name)
+            _require(share is None or 0 <= share <= 1, name, share, "a share from 0 to 1")
         _require(0 < self.target_rate <= 1, "target_rate", self.target_rate, "a rate in (0, 1]")
         shares = self.relabel_next + self.relabel_future + self.relabel_other
         _require(
@@ -410,6 +418,8 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "encoder_reach",
         "encoder_learning_rate",
         "inverse",
+        "joint_pairs",
+        "latent_rewarded_share",
         "group_windows",
         "group_reach",
         "group_goals",

@@ -70,9 +70,25 @@ class Task:
 
 
 _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
-    "train": {"c1": 0.02, "rewarded_share": 0.0, "group_reach": 8, "reconstruction": 0.0, "latent_horizon": 20},
+    "train": {
+        "encoder_steps": 3_000,
+        "reconstruction_side": 32,
+        "reconstruction": 0.0,
+        "joint_steps": 1_500,
+        "batch_windows": 64,
+        "window": 3,
+        "value_transitions": 0,
+        "group_windows": 4,
+        "group_reach": 8,
+        "c0": 1.0,
+        "c1": 0.02,
+        "latent_steps": 3_000,
+        "latent_horizon": 20,
+        "latent_rewarded_share": 0.0,
+    },
     "planner": {
         "n_iter": 500,
+        "n_sim": 10,
         "discard_low_exponent": 20.0,
         "p_sparse": 0.9,
         "p_value": 0.1,

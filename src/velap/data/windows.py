@@ -71,10 +71,13 @@ class WindowSampler:
         if len(self.transitions) == 0:
             raise DatasetError("the dataset has no transition to train on; expected episodes of at least one step.")
 
-    def sample(self, windows: int, length: int, whole: bool, generator: torch.Generator) -> Batch:
+    def sample(
+        self, windows: int, length: int, whole: bool, generator: torch.Generator, *, rewarded_share: float | None = None
+    ) -> Batch:
         """B `windows` of L `length` steps; with `whole` the values learn from transitions and the dynamics from starts all
-        over them (as many as the config says), else from each window's first."""
-        _, last, at = self._draw_windows(windows, length, whole, generator)
+        over them (as many as the config says), else from each window's first. `rewarded_share` replaces the config's."""
+        share = self.config.rewarded_share if rewarded_share is None else rewarded_share
+        _, last, at = self._draw_windows(windows, length, whole, share, generator)
         window_rows = torch.minimum(at[:, None] + torch.arange(length + 1, device=self.device), last[:, None])
         valid = at[:, None] + torch.arange(length, device=self.device) < last[:, None]
         positions = torch.arange(windows * (length + 1), device=self.device).view(windows, length + 1)
@@ -122,7 +125,7 @@ class WindowSampler:
         return self.frames.index_select(0, index.flatten()).view(*index.shape, *self.frames.shape[1:])
 
     def _draw_windows(
-        self, windows: int, length: int, whole: bool, generator: torch.Generator
+        self, windows: int, length: int, whole: bool, rewarded_share: float, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """First row and last row of each window's episode, and the window's first row, each int64 [B]."""
 
@@ -132,8 +135,8 @@ class WindowSampler:
         anchor = draw(self.transitions, windows)
         if self.config.group_windows > 1:
             anchor = self._gather(anchor, generator)
-        if self.config.rewarded_share > 0 and len(self.rewarded):
-            rare = torch.rand(windows, generator=generator, device=self.device) < self.config.rewarded_share
+        if rewarded_share > 0 and len(self.rewarded):
+            rare = torch.rand(windows, generator=generator, device=self.device) < rewarded_share
             anchor = torch.where(rare, draw(self.rewarded, windows), anchor)
         first, last = self.first[anchor], self.last[anchor]
         if not whole:

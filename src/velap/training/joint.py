@@ -95,7 +95,9 @@ class JointLearner:
         self.decoder = None
         if config.reconstruction > 0:
             self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
-        self.pairs = PairObjective(model, config, sampler, generator) if config.encoder_steps > 0 else None
+        self.pairs = None
+        if config.encoder_steps > 0 or config.joint_pairs > 0:
+            self.pairs = PairObjective(model, config, sampler, generator)
         self.cache: Tensor | None = None
         self.updates = 0
         self._optimise(config.learning_rate, encoder=True)
@@ -130,6 +132,7 @@ class JointLearner:
         model = self.model
         parts: list[nn.Module] = [model.encoder] if encoder else []
         parts += [self.decoder] if encoder and self.decoder is not None else []
+        parts += [self.pairs] if encoder and self.pairs is not None and self.config.joint_pairs > 0 else []
         parts += [model.dynamics, model.local_critics, model.global_critic]
         self.model_parameters = [p for part in parts for p in part.parameters()]
         acting: list[nn.Module] = [model.local_policy, model.global_policy, model.action_model]
@@ -139,7 +142,7 @@ class JointLearner:
 
     def encoder_step(self) -> Info:
         """One update of the encoder alone, on pairs of states (ours)."""
-        assert self.pairs is not None and self.pair_optimizer is not None, "encoder_steps is 0"
+        assert self.pairs is not None and self.pair_optimizer is not None, "encoder_steps and joint_pairs are 0"
         self.pair_optimizer.zero_grad(set_to_none=True)
         loss, info = self.pairs.loss(self.model, self.generator)
         loss.backward()
@@ -170,6 +173,10 @@ class JointLearner:
                 loss, more = loss + config.reconstruction * reconstruction, {**more, "reconstruction/loss": pixels["loss"]}
             loss.backward()
         encoded.backward(latents.grad)
+        if self.pairs is not None and config.joint_pairs > 0:
+            loss, pairs = self.pairs.loss(self.model, self.generator)
+            (config.joint_pairs * loss).backward()
+            more |= pairs
         with self._threads(batch):
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch)}
 
@@ -192,7 +199,8 @@ class JointLearner:
         """One update on cached latents: the dynamics by rollout error, the other heads as before (when `latent_heads`)."""
         assert self.cache is not None, "begin_latent_phase comes first"
         config = self.config
-        batch = self.sampler.sample(config.latent_batch, config.latent_horizon, False, self.generator)
+        share = config.latent_rewarded_share
+        batch = self.sampler.sample(config.latent_batch, config.latent_horizon, False, self.generator, rewarded_share=share)
         latents = self.cache[batch.rows]
         self.model_optimizer.zero_grad(set_to_none=True)
         with self._threads(batch):
