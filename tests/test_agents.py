@@ -126,6 +126,44 @@ def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: in
     assert (env.agent_position()[0] > 0) == gets_there
 
 
+def test_the_lookahead_takes_a_stronger_action_where_it_comes_nearer() -> None:
+    model = ToyModel(propose=lambda z, noise: torch.zeros_like(z))
+    model.act_local = lambda latent, goal: 0.3 * (goal - latent) / (goal - latent).norm(dim=-1, keepdim=True)
+    for gain, strength in ((1.0, 0.3), (2.0, 0.6), (10.0, 1.0)):
+        agent = VelapAgent(model, override(toy_config(n_iter=1), controller={"lookahead_gain": gain, "n_replan": 100}))
+        agent.act(frames_at(START))
+        with torch.inference_mode():
+            set_plan(agent, [START, (START[0], START[1] + 9.0)])
+        np.testing.assert_allclose(agent.act(frames_at(START))[0], [0.0, ACTION_SCALE * strength], atol=0.03)
+
+
+@pytest.mark.parametrize(("held", "strength"), [(0, 0.4), (3, 1.0)])
+def test_near_the_goal_a_stronger_action_than_the_policys_wins_by_its_value(held: int, strength: float) -> None:
+    model = ToyModel()
+    model.act_global = lambda latent: torch.tensor([0.4, 0.0], dtype=latent.dtype).expand_as(latent)
+    agent = VelapAgent(model, override(toy_config(), controller={"goal_lookahead": held}))
+    action = agent.act(frames_at((1.5, 0.0)))
+    assert agent.near_goal.tolist() == [True]
+    np.testing.assert_allclose(action[0], [ACTION_SCALE * strength, 0.0], atol=0.03)
+
+
+def test_a_place_that_promises_the_goal_and_keeps_the_robot_loses_its_promise() -> None:
+    agent = VelapAgent(ToyModel(), override(toy_config(n_iter=20), controller={"revisit_penalty": 0.5}))
+    near, other = (1.5, 0.0), (5.5, 0.0)
+    agent.reset(np.ones(2, bool), np.array([0, 1]))
+    led = []
+    for _ in range(4):
+        agent.act(frames_at(near, START))
+        led.append(bool(agent.near_goal[0]))
+    # 4.5 steps away by Q^g, stop at 5: one visit more than half a step
+    assert led == [True, True, False, False]
+    agent.act(frames_at(other, START))
+    assert agent.near_goal.tolist() == [True, False], "elsewhere nothing is lost"
+    agent.reset(np.array([True, False]))
+    agent.act(frames_at(near, START))
+    assert agent.near_goal[0], "a new episode starts without a past"
+
+
 @pytest.mark.parametrize(("residuals", "leaves"), [(0, False), (20, True)])
 def test_residuals_leave_a_wall_that_the_dynamics_walk_through(residuals: int, leaves: bool) -> None:
     model = ToyModel(step=lambda z, a: z + SPEED * a / a.norm(dim=-1, keepdim=True).clamp(min=1))

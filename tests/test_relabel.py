@@ -103,6 +103,8 @@ def test_rewarded_share_draws_rare_rewards():
     rich = sampler(make_store((9,) * 50, (3,)), rewarded_share=0.5, **shares(next_=1.0))
     counts = [s.sample(200, 3, False, torch.Generator().manual_seed(0)).reward.sum().item() for s in (plain, rich)]
     assert counts[0] < 5 and 70 < counts[1] < 130
+    replaced = rich.sample(200, 3, False, torch.Generator().manual_seed(0), rewarded_share=0.0)
+    assert replaced.reward.sum() < 5
 
 
 def test_held_out_episodes_are_never_drawn():

@@ -94,8 +94,6 @@ class TrainConfig:
     """Peak learning rate of the encoder phase, cosine to a hundredth. ours."""
     inverse: float = 0.3
     """Weight of the summed actions between two states beside the reconstruction of both, in the encoder phase. ours."""
-    joint_pairs: float = 0.0
-    """Weight of the encoder phase's objective in the joint phase, on pairs of its own; 0 has none. ours."""
     joint_steps: int = 4_000
     """Model updates of the joint phase [steps]. ours: the paper gives no number."""
     batch_windows: int = 24
@@ -206,7 +204,7 @@ class TrainConfig:
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("encoder_learning_rate", "learning_rate", "latent_learning_rate", "temperature"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        for name in ("inverse", "joint_pairs", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
+        for name in ("inverse", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         _require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
         _require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
@@ -326,12 +324,24 @@ class ControllerConfig:
     space zigzag, but a shortcut may cut corners."""
     residuals: int = 0
     """Last steps of the episode whose prediction errors correct h in lookahead and plans; 0 trusts h [steps]. ours."""
+    lookahead_gain: float = 1.0
+    """All actions of the lookahead compete with themselves times this, cut to the limits, as well; 1 has none. ours: g and
+    π^l are as slow as the data."""
+    goal_lookahead: int = 0
+    """π^g competes with stronger versions of its action, each held for this many simulated steps and judged by Q^g; 0 acts
+    by π^g alone [steps]. ours."""
+    revisit_penalty: float = 0.0
+    """Every state that the episode has been in moves the goal away from its surroundings by this [steps]; 0 trusts Q^g.
+    ours: plans and π^g then leave places that promise the goal and do not keep it."""
 
     def __post_init__(self) -> None:
         _require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")
         _require(self.residuals >= 0, "residuals", self.residuals, "0 or more steps")
         _require(self.shortcut_exponent >= 0, "shortcut_exponent", self.shortcut_exponent, "0 or more")
         _require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
+        _require(self.goal_lookahead >= 0, "goal_lookahead", self.goal_lookahead, "0 or more steps")
+        _require(self.lookahead_gain >= 1, "lookahead_gain", self.lookahead_gain, "a factor of 1 or more")
+        _require(self.revisit_penalty >= 0, "revisit_penalty", self.revisit_penalty, "0 or more steps")
         _require(self.lookahead_samples >= 1, "lookahead_samples", self.lookahead_samples, "at least 1 action")
 
 
@@ -418,7 +428,6 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "encoder_reach",
         "encoder_learning_rate",
         "inverse",
-        "joint_pairs",
         "latent_rewarded_share",
         "group_windows",
         "group_reach",
@@ -428,7 +437,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "reconstruction_side",
         "shift",
     ),
-    "controller": ("residuals", "shortcut_exponent"),
+    "controller": ("residuals", "shortcut_exponent", "lookahead_gain", "goal_lookahead", "revisit_penalty"),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 

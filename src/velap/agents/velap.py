@@ -15,6 +15,7 @@ from torch import Tensor
 
 from velap.agents.base import masked_seeds
 from velap.agents.residuals import Residuals, Step
+from velap.agents.revisits import Revisits
 from velap.models.horizon import q_from_steps
 from velap.search.est import plan
 from velap.search.types import Plan, SearchFns
@@ -32,6 +33,8 @@ class VelapAgent:
     """
 
     method = "velap"
+    GOAL_GAINS = (1.0, 1.5, 2.5)
+    """How much stronger than π^g says the actions are that compete with its own, before they are cut to the limits."""
 
     def __init__(self, model: LatentModel, config: Config) -> None:
         self.frame_stack = config.model.frame_stack
@@ -39,11 +42,11 @@ class VelapAgent:
         self.last_plan: Plan | None = None
         """A plan of the last `act` that planned, kept for figures and videos."""
         self.last_plan_rows: NDArray[np.int64] = np.empty(0, np.int64)
-        """Rows of `last_plan`. Rows whose dynamics are corrected plan alone."""
+        """Rows of `last_plan`. Rows whose model their episode corrects plan alone."""
         self.planned_rows: NDArray[np.int64] = np.empty(0, np.int64)
         """Rows that planned in the last `act`."""
         self.last_values: NDArray[np.float32] = np.empty(0, np.float32)
-        """[B] Q^g of the last states [Q-value]."""
+        """[B] Q^g of the last states, less what standing there before has cost (`revisit_penalty`) [Q-value]."""
         self.near_goal: NDArray[np.bool_] = np.empty(0, bool)
         """[B] rows that π^g led in the last `act` because the goal was near."""
         self._model = model
@@ -51,6 +54,7 @@ class VelapAgent:
         self._planner = config.planner
         self._n_replan = config.controller.n_replan
         self._lookahead, self._samples = config.controller.lookahead, config.controller.lookahead_samples
+        self._gain, self._goal_lookahead = config.controller.lookahead_gain, config.controller.goal_lookahead
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
         shortcut = config.controller.shortcut_exponent
@@ -59,6 +63,9 @@ class VelapAgent:
         self._residuals: Residuals | None = None
         if config.controller.residuals:
             self._residuals = Residuals(config.controller.residuals, self._fns.step, self._fns.step_distance)
+        self._revisits: Revisits | None = None
+        if config.controller.revisit_penalty > 0:
+            self._revisits = Revisits(config.controller.revisit_penalty, self._fns.step_distance, self._fns.discount)
         self._generators: list[torch.Generator] = []
         self._plan_age = torch.empty(0, dtype=torch.long)
         self._waypoints = torch.empty(0, 1, 0)
@@ -77,6 +84,8 @@ class VelapAgent:
         self._length[started] = 0
         if self._residuals is not None:
             self._residuals.forget(started)
+        if self._revisits is not None:
+            self._revisits.forget(started)
 
     def _allocate(self, batch: int) -> None:
         """Empty state for `batch` rows."""
@@ -96,6 +105,8 @@ class VelapAgent:
         if self._residuals is not None:
             self._residuals.observe(latents)
         values = self._fns.value(latents)
+        if self._revisits is not None:
+            values = self._revisits.observe(latents, values)
         near_goal = values > self._stop_value
         self.last_values, self.near_goal = values.float().cpu().numpy(), near_goal.cpu().numpy()
         self._replan(latents, (self._plan_age >= self._n_replan) & ~near_goal)
@@ -104,7 +115,7 @@ class VelapAgent:
 
         # A plan of the root alone leads nowhere, and a row near the goal may have none: π^g acts in both.
         by_waypoint = ~near_goal & (self._length > 1)
-        actions = self._model.act_global(latents)
+        actions = self._act_global(latents)
         if by_waypoint.any():
             rows = torch.arange(len(latents), device=self._device)
             local = self._act_local(latents, self._waypoints[rows, self._current])
@@ -125,14 +136,32 @@ class VelapAgent:
         shape = (self._samples, self._fns.noise_dim)
         drawn = [torch.randn(shape, generator=generator) for generator in self._generators]
         noise = torch.stack(drawn).to(latents)
-        starts = latents.unsqueeze(1).expand(-1, self._samples + 1, -1)
-        actions = torch.cat([policy.unsqueeze(1), self._fns.propose(starts[:, 1:], noise)], 1)
-        ends = starts
+        sampled = self._fns.propose(latents.unsqueeze(1).expand(-1, self._samples, -1), noise)
+        actions = torch.cat([policy.unsqueeze(1), sampled], 1)
+        if self._gain != 1:
+            actions = torch.cat([actions, (self._gain * actions).clamp(-1, 1)], 1)
         step = self._fns.step if self._residuals is None else self._residuals.step
-        for _ in range(self._lookahead):
-            ends = step(ends, actions)
+        ends = self._held(latents, actions, step, self._lookahead)
         q_min, _ = self._fns.reach(ends, waypoints.unsqueeze(1).expand_as(ends))
         return actions[torch.arange(len(actions), device=actions.device), q_min.argmax(1)]
+
+    def _act_global(self, latents: Tensor) -> Tensor:
+        """π^g, or the best of it and stronger versions of its action under the dynamics, by Q^g (ours): actions [B, A]."""
+        policy = self._model.act_global(latents)
+        if self._goal_lookahead == 0:
+            return policy
+        gains = torch.tensor(self.GOAL_GAINS, device=policy.device).view(-1, 1)
+        actions = (gains * policy.unsqueeze(1)).clamp(-1, 1)
+        ends = self._held(latents, actions, self._fns.step, self._goal_lookahead)
+        return actions[torch.arange(len(actions), device=actions.device), self._fns.value(ends).argmax(1)]
+
+    @staticmethod
+    def _held(latents: Tensor, actions: Tensor, step: Step, count: int) -> Tensor:
+        """Where `count` steps of each of `actions` [B, S, A] lead from latents [B, D]: [B, S, D]."""
+        ends = latents.unsqueeze(1).expand(-1, actions.shape[1], -1)
+        for _ in range(count):
+            ends = step(ends, actions)
+        return ends
 
     def _replan(self, latents: Tensor, due: Tensor) -> None:
         """Plan for the rows `due` [B] from `latents` [B, D] and store their waypoints."""
@@ -140,16 +169,21 @@ class VelapAgent:
         self.planned_rows = np.flatnonzero(due.cpu().numpy())
         if len(self.planned_rows) == 0:
             return
-        corrected = {int(row): step for row in self.planned_rows if (step := self._correction(int(row))) is not None}
-        plain = np.array([row for row in self.planned_rows if int(row) not in corrected], np.int64)
+        own = {int(row): fns for row in self.planned_rows if (fns := self._own_fns(int(row))) is not None}
+        plain = np.array([row for row in self.planned_rows if int(row) not in own], np.int64)
         if len(plain):
             self._plan(self._fns, plain, latents)
-        for row, step in corrected.items():
-            self._plan(self._fns._replace(step=step, rollout=None), np.array([row]), latents)
+        for row, fns in own.items():
+            self._plan(fns, np.array([row]), latents)
 
-    def _correction(self, row: int) -> Step | None:
-        """h as the row's episode corrects it, where it does."""
-        return self._residuals.of_row(row) if self._residuals is not None else None
+    def _own_fns(self, row: int) -> SearchFns | None:
+        """The model as the row's episode corrects it, where it does."""
+        fns = self._fns
+        if self._residuals is not None and (step := self._residuals.of_row(row)) is not None:
+            fns = fns._replace(step=step, rollout=None)
+        if self._revisits is not None and (value := self._revisits.of_row(row, fns.value)) is not None:
+            fns = fns._replace(value=value)
+        return None if fns is self._fns else fns
 
     def _plan(self, fns: SearchFns, planned: NDArray[np.int64], latents: Tensor) -> None:
         """Plan for the rows `planned` [P] from `latents` [B, D] together."""

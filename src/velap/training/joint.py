@@ -95,9 +95,7 @@ class JointLearner:
         self.decoder = None
         if config.reconstruction > 0:
             self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
-        self.pairs = None
-        if config.encoder_steps > 0 or config.joint_pairs > 0:
-            self.pairs = PairObjective(model, config, sampler, generator)
+        self.pairs = PairObjective(model, config, sampler, generator) if config.encoder_steps > 0 else None
         self.cache: Tensor | None = None
         self.updates = 0
         self._optimise(config.learning_rate, encoder=True)
@@ -132,7 +130,6 @@ class JointLearner:
         model = self.model
         parts: list[nn.Module] = [model.encoder] if encoder else []
         parts += [self.decoder] if encoder and self.decoder is not None else []
-        parts += [self.pairs] if encoder and self.pairs is not None and self.config.joint_pairs > 0 else []
         parts += [model.dynamics, model.local_critics, model.global_critic]
         self.model_parameters = [p for part in parts for p in part.parameters()]
         acting: list[nn.Module] = [model.local_policy, model.global_policy, model.action_model]
@@ -142,7 +139,7 @@ class JointLearner:
 
     def encoder_step(self) -> Info:
         """One update of the encoder alone, on pairs of states (ours)."""
-        assert self.pairs is not None and self.pair_optimizer is not None, "encoder_steps and joint_pairs are 0"
+        assert self.pairs is not None and self.pair_optimizer is not None, "encoder_steps is 0"
         self.pair_optimizer.zero_grad(set_to_none=True)
         loss, info = self.pairs.loss(self.model, self.generator)
         loss.backward()
@@ -173,10 +170,6 @@ class JointLearner:
                 loss, more = loss + config.reconstruction * reconstruction, {**more, "reconstruction/loss": pixels["loss"]}
             loss.backward()
         encoded.backward(latents.grad)
-        if self.pairs is not None and config.joint_pairs > 0:
-            loss, pairs = self.pairs.loss(self.model, self.generator)
-            (config.joint_pairs * loss).backward()
-            more |= pairs
         with self._threads(batch):
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch)}
 
