@@ -237,6 +237,16 @@ def test_pairs_lie_in_one_training_episode_and_know_their_actions(tmp_path):
         assert torch.allclose(sampler.actions[a:b].sum(0).double(), total, atol=1e-6)
 
 
+def test_a_share_of_the_pairs_begins_shortly_before_a_reward(tmp_path):
+    run = trainer(tmp_path, encoder_steps=1, encoder_pairs=500, encoder_reach=2, encoder_rewarded_share=1.0)
+    now, then = run.learner.pairs.draw(run.generator)
+    rewarded = run.sampler.rewarded
+    behind = (rewarded - now.unsqueeze(1)).clamp(min=-1)
+    assert ((behind >= 0) & (behind < 2)).any(1).all()
+    assert torch.equal(run.sampler.first[now], run.sampler.first[then])
+    assert set((then - now).tolist()) <= {1, 2}
+
+
 def test_pairs_teach_where_the_agent_went(tmp_path):
     """Frames that show a dot at the sum of all actions: the error of the summed actions falls."""
     store = make_store(episodes=40)

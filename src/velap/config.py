@@ -90,6 +90,9 @@ class TrainConfig:
     """Pairs a batch of the encoder phase, drawn from all over the data. ours."""
     encoder_reach: int = 20
     """Most steps between the two states of a pair [steps]. ours."""
+    encoder_rewarded_share: float = 0.0
+    """Share of pairs that begin at most `encoder_reach` steps before a reward, beyond chance. ours: objects that hardly ever
+    move are few pixels, and only there do they pay."""
     encoder_learning_rate: float = 1e-3
     """Peak learning rate of the encoder phase, cosine to a hundredth. ours."""
     inverse: float = 0.3
@@ -210,7 +213,7 @@ class TrainConfig:
         _require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
         _require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
         _require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
-        for name in ("rewarded_share", "latent_rewarded_share"):
+        for name in ("rewarded_share", "latent_rewarded_share", "encoder_rewarded_share"):
             share = getattr(self, name)
             _require(share is None or 0 <= share <= 1, name, share, "a share from 0 to 1")
         _require(0 < self.target_rate <= 1, "target_rate", self.target_rate, "a rate in (0, 1]")
@@ -426,6 +429,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "encoder_steps",
         "encoder_pairs",
         "encoder_reach",
+        "encoder_rewarded_share",
         "encoder_learning_rate",
         "inverse",
         "latent_rewarded_share",

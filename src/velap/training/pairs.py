@@ -72,10 +72,15 @@ class PairObjective(nn.Module):
 
     def draw(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Rows int64 [P] of a state and of one at most `encoder_reach` steps later in the same episode."""
-        sampler, shape = self.sampler, (self.config.encoder_pairs,)
+        sampler, shape, reach = self.sampler, (self.config.encoder_pairs,), self.config.encoder_reach
         pool, device = sampler.transitions, sampler.device
         now = pool[torch.randint(len(pool), shape, generator=generator, device=device)]
-        ahead = torch.randint(1, self.config.encoder_reach + 1, shape, generator=generator, device=device)
+        if self.config.encoder_rewarded_share > 0 and len(sampler.rewarded):
+            row = sampler.rewarded[torch.randint(len(sampler.rewarded), shape, generator=generator, device=device)]
+            before = torch.randint(reach, shape, generator=generator, device=device)
+            chosen = torch.rand(shape, generator=generator, device=device) < self.config.encoder_rewarded_share
+            now = torch.where(chosen, torch.maximum(row - before, sampler.first[row]), now)
+        ahead = torch.randint(1, reach + 1, shape, generator=generator, device=device)
         return now, torch.minimum(now + ahead, sampler.last[now])
 
     def loss(self, model: LatentModel, generator: torch.Generator) -> tuple[Tensor, Info]:
