@@ -98,3 +98,10 @@ def test_unknown_fields_and_names_are_refused() -> None:
 def test_configs_are_frozen() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         Config("task", "default").train.discount = 0.5  # type: ignore[misc]
+
+
+def test_cross_entropy_asks_for_bounded_critics():
+    config = make_config("SpiralMaze")
+    with pytest.raises(ConfigError, match="critic_bounded"):
+        override(config, train={"critic_loss": "cross_entropy"}, model={"critic_bounded": False})
+    assert override(config, train={"critic_loss": "cross_entropy"}).hash() != config.hash()

@@ -9,6 +9,7 @@ from torch import tensor
 from velap.training.losses import (
     action_model_loss,
     critic_loss,
+    cross_entropy_critic_loss,
     displacement_loss,
     infonce_loss,
     policy_loss,
@@ -48,6 +49,27 @@ def test_critic_loss_is_mean_over_members_of_squared_error():
     # member 1: (0.25 + 0) / 2, member 2: (0 + 1) / 2
     assert loss.item() == pytest.approx((0.125 + 0.5) / 2)
     assert info["q"].item() == pytest.approx(0.375)
+
+
+def test_cross_entropy_is_zero_at_the_target_and_pulls_far_values_as_hard_as_near_ones():
+    target = tensor([0.01, 0.6])
+    loss, info = cross_entropy_critic_loss(tensor([[0.01, 0.6], [0.02, 0.6]]), target, ONES)
+    divergence = 0.01 * math.log(0.5) + 0.99 * math.log(0.99 / 0.98)
+    assert loss.item() == pytest.approx(divergence / 4, abs=1e-7)
+    assert info["q"].item() == pytest.approx((0.01 + 0.6 + 0.02 + 0.6) / 4)
+    raw = torch.tensor([-6.0, 0.0], requires_grad=True)
+    cross_entropy_critic_loss(torch.sigmoid(raw), target, ONES)[0].backward()
+    torch.testing.assert_close(raw.grad, (torch.sigmoid(raw) - target).detach() / 2)
+    assert cross_entropy_critic_loss(tensor([1.0, 0.0]), tensor([1.0, 0.0]), ONES)[0].item() == 0
+
+
+def test_a_relative_policy_loss_counts_values_in_their_own_size():
+    action, data = torch.zeros(2, 2), tensor([[0.0, 0.0], [0.0, 2.0]])
+    q = tensor([0.001, 0.5], requires_grad=True)
+    loss, _ = policy_loss(q, action, data, 0.5, ONES, relative=True)
+    assert loss.item() == pytest.approx(-1 + 0.5 * 1.0)
+    loss.backward()
+    torch.testing.assert_close(q.grad, -1 / (2 * q.detach()))
 
 
 def test_policy_loss_adds_value_and_weighted_imitation():

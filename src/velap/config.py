@@ -16,6 +16,7 @@ from velap.errors import ConfigError
 
 Norm = Literal["batch", "layer", "none"]
 DynamicsLoss = Literal["infonce", "mse"]
+CriticLoss = Literal["mse", "cross_entropy"]
 Anchor = Literal["none", "reject", "snap"]
 Precision = Literal["float32", "bfloat16"]
 
@@ -142,6 +143,12 @@ class TrainConfig:
     """k of Eq. 9 [steps], App. B.5."""
     dynamics_loss: DynamicsLoss = "infonce"
     """Loss of h in the joint phase: Eq. 9, or mean-squared error (App. E.3's comparison)."""
+    critic_loss: CriticLoss = "mse"
+    """Loss of the critics: Eq. 3 and 4, or the cross entropy of bounded ones. ours: squared errors of far states' values,
+    hundredths, teach nothing."""
+    policy_relative: bool = False
+    """The policies gain by Q in its own size instead of Q (Eq. 5). ours: far from the goal Q is small, and imitation would
+    be all that counts."""
     relabel_next: float = 0.2
     """Share of goals that are the next state (strategy a of B.4). ours: the paper gives no shares."""
     relabel_future: float = 0.4
@@ -237,6 +244,9 @@ class TrainConfig:
             f"at least dynamics_horizon = {self.dynamics_horizon} steps",
         )
         _require(self.precision in get_args(Precision), "precision", self.precision, f"one of {get_args(Precision)}")
+        _require(
+            self.critic_loss in get_args(CriticLoss), "critic_loss", self.critic_loss, f"one of {get_args(CriticLoss)}"
+        )
 
 
     @property
@@ -359,6 +369,14 @@ class Config:
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
 
+    def __post_init__(self) -> None:
+        _require(
+            self.model.critic_bounded or self.train.critic_loss == "mse",
+            "critic_loss",
+            self.train.critic_loss,
+            "'mse' where `critic_bounded` is off: cross entropy asks for Q-values in [0, 1]",
+        )
+
     def to_json(self) -> str:
         """Canonical JSON: sorted keys, so that equal configs are equal text.
 
@@ -433,6 +451,8 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "encoder_learning_rate",
         "inverse",
         "latent_rewarded_share",
+        "critic_loss",
+        "policy_relative",
         "group_windows",
         "group_reach",
         "group_goals",

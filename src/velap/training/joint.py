@@ -23,6 +23,7 @@ from velap.training.losses import (
     Info,
     action_model_loss,
     critic_loss,
+    cross_entropy_critic_loss,
     infonce_loss,
     policy_loss,
     polyak,
@@ -247,8 +248,9 @@ class JointLearner:
             local_goal = td_target(batch.goals.reward, batch.goals.proceeds, next_local, config.discount)
             next_global = model.bound(self.global_target(torch.cat([then, model.act_global(then)], -1))).amin(0)
             global_goal = td_target(batch.reward, batch.proceeds, next_global, config.discount)
-        local, local_info = critic_loss(model.local_q(now, goal, batch.action), local_goal, weight)
-        task, task_info = critic_loss(model.global_qs(now, batch.action), global_goal, weight)
+        error = cross_entropy_critic_loss if config.critic_loss == "cross_entropy" else critic_loss
+        local, local_info = error(model.local_q(now, goal, batch.action), local_goal, weight)
+        task, task_info = error(model.global_qs(now, batch.action), global_goal, weight)
         info = {
             "local/loss": local_info["loss"],
             "local/q": local_info["q"],
@@ -265,8 +267,9 @@ class JointLearner:
         with evaluated(model.local_critics, model.global_critic):
             local_q = model.local_q(now, goal, local_action).amin(0)
             global_q = model.global_q(now, global_action)
-        local, local_info = policy_loss(local_q, local_action, batch.action, config.c2, weight)
-        task, task_info = policy_loss(global_q, global_action, batch.action, config.c3, weight)
+        relative = config.policy_relative
+        local, local_info = policy_loss(local_q, local_action, batch.action, config.c2, weight, relative=relative)
+        task, task_info = policy_loss(global_q, global_action, batch.action, config.c3, weight, relative=relative)
         mean, log_variance = model.action_model.posterior(now, batch.action)
         noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)
         decoded = model.propose(now, reparameterise(mean, log_variance, noise))

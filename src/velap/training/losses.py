@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from velap.models.horizon import Q_FLOOR
 
 Info = dict[str, Tensor]
 
@@ -31,10 +33,28 @@ def critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Info
     return loss, {"loss": loss.detach(), "q": weighted_mean(q.detach(), weight)}
 
 
-def policy_loss(q: Tensor, action: Tensor, data_action: Tensor, imitation: float, weight: Tensor) -> tuple[Tensor, Info]:
-    """-Q + c · (π - a)², Eq. 5. q [T], actions [T, A] in [-1, 1]; the square is averaged over A, as TD3-BC does."""
+def cross_entropy_critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Info]:
+    """Cross entropy of bounded critics (ours): the same mean as the squared TD error's, but errors of small values count.
+
+    q [n, T] or [T] and target [T], both in [0, 1] [Q-value]. The gradient of the squared error at the output before the
+    sigmoid is (q - target) · q · (1 - q), which vanishes far from the goal; here it is q - target. The loss is less the
+    target's entropy, so that it is 0 at best.
+    """
+    target = target.expand_as(q)
+    entropy = nn.functional.binary_cross_entropy(target, target, reduction="none")
+    loss = weighted_mean(nn.functional.binary_cross_entropy(q, target, reduction="none") - entropy, weight)
+    return loss, {"loss": loss.detach(), "q": weighted_mean(q.detach(), weight)}
+
+
+def policy_loss(
+    q: Tensor, action: Tensor, data_action: Tensor, imitation: float, weight: Tensor, *, relative: bool = False
+) -> tuple[Tensor, Info]:
+    """-Q + c · (π - a)², Eq. 5. q [T], actions [T, A] in [-1, 1]; the square is averaged over A, as TD3-BC does.
+
+    With `relative` (ours) Q counts in its own size, so that steps count alike far from the goal and near it.
+    """
     cloning = weighted_mean((action - data_action).square().mean(-1), weight)
-    loss = imitation * cloning - weighted_mean(q, weight)
+    loss = imitation * cloning - weighted_mean(q / q.detach().clamp(min=Q_FLOOR) if relative else q, weight)
     return loss, {"loss": loss.detach(), "imitation": cloning.detach()}
 
 
