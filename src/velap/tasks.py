@@ -85,6 +85,8 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "latent_steps": 3_000,
         "latent_horizon": 20,
         "latent_rewarded_share": 0.0,
+        "critic_loss": "cross_entropy",
+        "policy_relative": True,
     },
     "planner": {
         "n_iter": 500,
@@ -96,7 +98,14 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "expansion_weight": 1.0,
         "anchor": "none",
     },
-    "controller": {**ONE_SCENE["controller"], "stop_exponent": 35.0, "shortcut_exponent": 12.0},
+    "controller": {
+        **ONE_SCENE["controller"],
+        "stop_exponent": 35.0,
+        "shortcut_exponent": 12.0,
+        "lookahead_gain": 2.0,
+        "goal_lookahead": 3,
+        "revisit_penalty": 1.0,
+    },
 }
 """ours: the manipulation tasks plan like SpiralMaze does by default; π^g, which has seen experts near the goal, takes over
 earlier."""
