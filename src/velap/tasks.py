@@ -100,6 +100,7 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "controller": {
         **ONE_SCENE["controller"],
+        "n_replan": 25,
         "stop_exponent": 35.0,
         "shortcut_exponent": 12.0,
         "lookahead_gain": 2.0,
