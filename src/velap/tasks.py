@@ -108,8 +108,9 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "revisit_penalty": 1.0,
     },
 }
-"""ours: the manipulation tasks plan like SpiralMaze does by default; π^g, which has seen experts near the goal, takes over
-earlier."""
+"""ours: the encoder first learns where things are from pairs of states, a short joint phase of small windows tells it what
+counts, and the latent phase learns the rest. The search is SpiralMaze's; π^g, which has seen experts near the goal, takes
+over earlier."""
 
 TASKS: dict[str, Task] = {
     task.name: task
