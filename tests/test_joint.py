@@ -237,6 +237,31 @@ def test_pairs_lie_in_one_training_episode_and_know_their_actions(tmp_path):
         assert torch.allclose(sampler.actions[a:b].sum(0).double(), total, atol=1e-6)
 
 
+def test_the_critics_loss_and_the_policies_gain_are_those_of_the_config(tmp_path):
+    runs = {name: trainer(tmp_path / name, **changes) for name, changes in {
+        "plain": {}, "entropy": {"critic_loss": "cross_entropy"}, "relative": {"policy_relative": True}}.items()}
+    infos = {}
+    for name, run in runs.items():
+        batch = run.sampler.sample(8, 3, True, torch.Generator().manual_seed(0))
+        latents = run.model.encode(run.sampler.stacks(batch.rows)).detach()
+        infos[name] = run.learner.value_loss(latents, batch)[1] | run.learner.acting_loss(latents, batch)[1]
+    plain, entropy, relative = infos["plain"], infos["entropy"], infos["relative"]
+    for loss in ("local/loss", "global/loss"):
+        assert entropy[loss] > 1.5 * plain[loss], "at least twice the squared error, by Pinsker's inequality"
+        assert torch.equal(relative[loss], plain[loss])
+    weight = runs["relative"].config.train.c3
+    assert relative["global/policy"].item() == pytest.approx(-1 + weight * relative["global/imitation"].item(), abs=1e-5)
+
+
+def test_the_latent_phase_has_its_own_share_of_rewards(tmp_path):
+    run = trainer(tmp_path, rewarded_share=1.0, latent_rewarded_share=0.0)
+    run.learner.begin_latent_phase()
+    shares, sample = [], run.sampler.sample
+    run.sampler.sample = lambda *args, **kwargs: shares.append(kwargs["rewarded_share"]) or sample(*args, **kwargs)
+    run.learner.latent_step()
+    assert shares == [0.0]
+
+
 def test_a_share_of_the_pairs_begins_shortly_before_a_reward(tmp_path):
     run = trainer(tmp_path, encoder_steps=1, encoder_pairs=500, encoder_reach=2, encoder_rewarded_share=1.0)
     now, then = run.learner.pairs.draw(run.generator)

@@ -92,8 +92,8 @@ class TrainConfig:
     encoder_reach: int = 20
     """Most steps between the two states of a pair [steps]. ours."""
     encoder_rewarded_share: float = 0.0
-    """Share of pairs that begin at most `encoder_reach` steps before a reward, beyond chance. ours: objects that hardly ever
-    move are few pixels, and only there do they pay."""
+    """Share of pairs that begin at most `encoder_reach` steps before a reward, beyond chance. ours, for objects that hardly
+    ever move otherwise; it did not help on FaucetClose (`docs/decisions.md`)."""
     encoder_learning_rate: float = 1e-3
     """Peak learning rate of the encoder phase, cosine to a hundredth. ours."""
     inverse: float = 0.3
