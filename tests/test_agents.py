@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from toy_env import ACTION_SCALE, SIDE, ToyEnv, ToyModel, draw, toy_config
-from toy_world import DISCOUNT, SPEED, START
+from toy_world import DISCOUNT, GOAL, SPEED, START, TIP
 from velap.agents.base import make_agent
 from velap.agents.velap import VelapAgent
 from velap.config import override
+from velap.errors import ConfigError
 
 
 def frames_at(*positions: tuple[float, float]) -> np.ndarray:
@@ -197,6 +198,40 @@ def test_plans_grow_along_the_corrected_dynamics() -> None:
     assert np.isfinite(agent.last_plan_ms).all()
     assert agent.last_plan is not None
     assert not torch.equal(agent.last_plan.tree.latents[0, 1], first.tree.latents[0, 1])
+
+
+def round_the_wall(z: torch.Tensor) -> torch.Tensor:
+    """Half a step up to the tip of the wall, over it, and down to the goal."""
+    x, y = z.unbind(-1)
+    up, over = z.new_tensor([0.0, 0.5]), z.new_tensor([0.5, 0.0])
+    to_goal = 0.5 * (z.new_tensor(GOAL) - z) / (z.new_tensor(GOAL) - z).norm(dim=-1, keepdim=True)
+    before = torch.where((y < TIP + 1).unsqueeze(-1), up, over)
+    return torch.where((x < 0.5).unsqueeze(-1), before, to_goal)
+
+
+@pytest.mark.parametrize(("horizon", "leads"), [(0, False), (12, False), (40, True)])
+def test_the_policy_of_successes_acts_where_it_gets_to_the_goal_in_time(horizon: int, leads: bool) -> None:
+    controller = {"success_rollout": horizon}
+    config = override(toy_config(n_iter=20), model={"success_policy": True}, controller=controller)
+    agent = VelapAgent(ToyModel(act_success=round_the_wall), config)
+    action = agent.act(frames_at(START))
+    assert (len(agent.planned_rows) == 0) == leads, "either it acts or a tree is grown"
+    if leads:
+        # its action at the highest gain that the box allows is there first
+        np.testing.assert_allclose(action[0], [0.0, ACTION_SCALE], atol=0.03)
+
+
+def test_rows_are_led_by_the_policy_of_successes_each_for_itself() -> None:
+    config = override(toy_config(n_iter=20), model={"success_policy": True}, controller={"success_rollout": 15})
+    agent = VelapAgent(ToyModel(act_success=round_the_wall), config)
+    agent.act(frames_at(START, (-1.0, 8.0), (9.0, 9.0)))
+    assert agent.planned_rows.tolist() == [0], "too far in the first, near enough in the others"
+
+
+def test_a_model_without_a_policy_of_successes_is_refused() -> None:
+    config = override(toy_config(), model={"success_policy": True}, controller={"success_rollout": 15})
+    with pytest.raises(ConfigError, match="clone_steps"):
+        VelapAgent(ToyModel(), config)
 
 
 def test_plan_of_the_root_alone_leaves_it_to_the_global_policy() -> None:

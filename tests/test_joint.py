@@ -10,7 +10,7 @@ import torch
 
 from velap.config import Config, ModelConfig, TrainConfig
 from velap.data.episodes import FrameStore
-from velap.errors import CheckpointError, DatasetError
+from velap.errors import CheckpointError, ConfigError, DatasetError
 from velap.models.latent import load_checkpoint
 from velap.runs import load_tensors
 from velap.training.joint import rollouts, shifted
@@ -317,6 +317,53 @@ def test_a_group_of_windows_is_shifted_as_one(tmp_path, whole):
         assert len(fits) == 1
     run.update()
     assert torch.equal(trainer(tmp_path / "plain").learner._augmented(stacks, batch), stacks)
+
+
+CLONED = dataclasses.replace(SMALL, success_policy=True)
+
+
+def test_the_clone_phase_moves_the_policy_of_successes_alone_towards_their_actions(tmp_path):
+    run = Trainer(config(CLONED, clone_steps=400), make_store(), tmp_path, 0, torch.device("cpu"))
+    while run.phase != "clone":
+        run.update()
+        before = {k: v.clone() for k, v in run.model.state_dict().items()}
+    first = run.update()["clone/loss"]
+    while run.step < run.total:
+        last = run.update()["clone/loss"]
+    changed = {k.split(".")[0] for k, v in run.model.state_dict().items() if not torch.equal(v, before[k])}
+    assert changed == {"success_policy"}
+    # two successful episodes of six steps in the store, none held out
+    assert run.sampler.episodes[run.sampler.rank_of_row[run.learner.successes]].unique().tolist() == [0, 1]
+    assert len(run.learner.successes) == 12 and last < 0.7 * first, "noise, learnt by heart"
+
+
+def test_a_resume_in_the_clone_phase_goes_on_to_the_same_bits(tmp_path):
+    def make(name):
+        return Trainer(config(CLONED, clone_steps=4), make_store(), tmp_path / name, 0, torch.device("cpu"))
+
+    straight, broken = make("a"), make("b")
+    for _ in range(straight.total):
+        straight.update()
+    for _ in range(straight.total - 2):
+        broken.update()
+    broken.save()
+    again = make("b")
+    again.resume()
+    for _ in range(2):
+        again.update()
+    expected = straight.model.state_dict()
+    assert all(torch.equal(v, expected[k]) for k, v in again.model.state_dict().items())
+    loaded, _, _ = load_checkpoint(again.finish("x").checkpoint)
+    assert loaded.search_fns()["act_success"](torch.zeros(2, SMALL.latent_dim)).shape == (2, 3)
+
+
+def test_nothing_to_clone_is_an_error(tmp_path):
+    store = make_store()
+    store = dataclasses.replace(store, rewards=np.zeros_like(store.rewards))
+    with pytest.raises(DatasetError, match="no successful episode"):
+        Trainer(config(CLONED, clone_steps=4), store, tmp_path, 0, torch.device("cpu"))
+    with pytest.raises(ConfigError, match="success_policy"):
+        config(clone_steps=4)
 
 
 def test_runs_older_than_a_field_can_be_resumed(tmp_path):

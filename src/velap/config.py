@@ -63,6 +63,8 @@ class ModelConfig:
     """Members of the local ensemble, Table 7."""
     n_global: int = 2
     """Members of the global critic, of which the minimum counts (TD3's two). ours; 1 in `paper`: Eq. 4 has no minimum."""
+    success_policy: bool = False
+    """A policy cloned from successful episodes beside π^g, as BC(D*) of D.1 but in the model. ours; off in `paper`."""
     latent_norm: bool = False
     """Latents are normalised to zero mean and unit variance over their dimensions. ours; off in `paper`."""
     bank_size: int = 4096
@@ -180,6 +182,9 @@ class TrainConfig:
     a share beyond chance makes states that look like rewarded ones too valuable."""
     latent_heads: bool = True
     """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
+    clone_steps: int = 0
+    """Updates of the last phase, on cached latents too: the policy of `success_policy` is cloned from the transitions of
+    successful episodes; 0 has none [steps]. ours."""
     holdout_episodes: int = 16
     """Unrewarded episodes kept out of training for the diagnostics. ours."""
     latent_learning_rate: float = 1e-3
@@ -194,7 +199,8 @@ class TrainConfig:
     """Model updates between checkpoints [steps]. ours."""
 
     def __post_init__(self) -> None:
-        for name in ("encoder_steps", "joint_steps", "latent_steps", "value_transitions", "dynamics_rollouts"):
+        phases = ("encoder_steps", "joint_steps", "latent_steps", "clone_steps")
+        for name in (*phases, "value_transitions", "dynamics_rollouts"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in (
             "encoder_pairs",
@@ -252,7 +258,7 @@ class TrainConfig:
     @property
     def steps(self) -> int:
         """Updates of all phases [steps]."""
-        return self.encoder_steps + self.joint_steps + self.latent_steps
+        return self.encoder_steps + self.joint_steps + self.latent_steps + self.clone_steps
 
 
 @dataclass(frozen=True)
@@ -343,6 +349,10 @@ class ControllerConfig:
     goal_lookahead: int = 0
     """π^g competes with stronger versions of its action, each held for this many simulated steps and judged by Q^g; 0 acts
     by π^g alone [steps]. ours."""
+    success_rollout: int = 0
+    """At every step the policy cloned from successes (`success_policy`) is simulated this far; where it gets to a node with
+    Q^g above τ_goal, it acts and nothing is planned; 0 has none [steps]. ours: errors of h that a search exploits, a policy
+    that knows nothing of h hardly meets."""
     revisit_penalty: float = 0.0
     """Every state that the episode has been in moves the goal away from its surroundings by this [steps]; 0 trusts Q^g.
     ours: plans and π^g then leave places that promise the goal and do not keep it."""
@@ -352,6 +362,7 @@ class ControllerConfig:
         _require(self.residuals >= 0, "residuals", self.residuals, "0 or more steps")
         _require(self.shortcut_exponent >= 0, "shortcut_exponent", self.shortcut_exponent, "0 or more")
         _require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
+        _require(self.success_rollout >= 0, "success_rollout", self.success_rollout, "0 or more steps")
         _require(self.goal_lookahead >= 0, "goal_lookahead", self.goal_lookahead, "0 or more steps")
         _require(self.lookahead_gain >= 1, "lookahead_gain", self.lookahead_gain, "a factor of 1 or more")
         _require(self.revisit_penalty >= 0, "revisit_penalty", self.revisit_penalty, "0 or more steps")
@@ -376,6 +387,8 @@ class Config:
             self.train.critic_loss,
             "'mse' where `critic_bounded` is off: cross entropy asks for Q-values in [0, 1]",
         )
+        for name, steps in (("clone_steps", self.train.clone_steps), ("success_rollout", self.controller.success_rollout)):
+            _require(self.model.success_policy or steps == 0, name, steps, "0 where `success_policy` is off")
 
     def to_json(self) -> str:
         """Canonical JSON: sorted keys, so that equal configs are equal text.
@@ -443,6 +456,7 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
+    "model": ("success_policy",),
     "train": (
         "encoder_steps",
         "encoder_pairs",
@@ -451,6 +465,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "encoder_learning_rate",
         "inverse",
         "latent_rewarded_share",
+        "clone_steps",
         "critic_loss",
         "policy_relative",
         "group_windows",
@@ -461,7 +476,8 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "reconstruction_side",
         "shift",
     ),
-    "controller": ("residuals", "shortcut_exponent", "lookahead_gain", "goal_lookahead", "revisit_penalty"),
+    "controller": ("residuals", "shortcut_exponent", "lookahead_gain", "goal_lookahead", "revisit_penalty",
+                   "success_rollout"),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 

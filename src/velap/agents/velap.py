@@ -16,6 +16,7 @@ from torch import Tensor
 from velap.agents.base import masked_seeds
 from velap.agents.residuals import Residuals, Step
 from velap.agents.revisits import Revisits
+from velap.agents.successes import SuccessRollouts
 from velap.models.horizon import q_from_steps
 from velap.search.est import plan
 from velap.search.types import Plan, SearchFns
@@ -34,7 +35,8 @@ class VelapAgent:
 
     method = "velap"
     GOAL_GAINS = (1.0, 1.5, 2.5)
-    """How much stronger than π^g says the actions are that compete with its own, before they are cut to the limits."""
+    """How much stronger than π^g, or the policy cloned from successes, says the actions are that compete with its own,
+    before they are cut to the limits."""
 
     def __init__(self, model: LatentModel, config: Config) -> None:
         self.frame_stack = config.model.frame_stack
@@ -60,6 +62,10 @@ class VelapAgent:
         shortcut = config.controller.shortcut_exponent
         self._shortcut_value = q_from_steps(shortcut, self._fns.discount) if shortcut > 0 else None
         self._device = next(model.parameters()).device
+        self._successes: SuccessRollouts | None = None
+        if config.controller.success_rollout > 0:
+            goal_value = q_from_steps(config.planner.goal_exponent, self._fns.discount)
+            self._successes = SuccessRollouts(self._fns, config.controller.success_rollout, goal_value, self.GOAL_GAINS)
         self._residuals: Residuals | None = None
         if config.controller.residuals:
             self._residuals = Residuals(config.controller.residuals, self._fns.step, self._fns.step_distance)
@@ -109,7 +115,8 @@ class VelapAgent:
             values = self._revisits.observe(latents, values)
         near_goal = values > self._stop_value
         self.last_values, self.near_goal = values.float().cpu().numpy(), near_goal.cpu().numpy()
-        self._replan(latents, (self._plan_age >= self._n_replan) & ~near_goal)
+        led = self._successes.lead(latents) if self._successes is not None else None
+        self._replan(latents, (self._plan_age >= self._n_replan) & ~(near_goal if led is None else near_goal | led.arrives))
         self._advance(latents)
         self._plan_age += 1
 
@@ -120,6 +127,8 @@ class VelapAgent:
             rows = torch.arange(len(latents), device=self._device)
             local = self._act_local(latents, self._waypoints[rows, self._current])
             actions = torch.where(by_waypoint[:, None], local, actions)
+        if led is not None:
+            actions = torch.where(led.arrives[:, None], led.actions, actions)
         if self._residuals is not None:
             self._residuals.acted(latents, actions)
         return self._model.to_env(actions)

@@ -112,6 +112,13 @@ class WindowSampler:
             goals=goals._replace(proceeds=goals.proceeds * proceeds),
         )
 
+    def successes(self) -> Tensor:
+        """Rows int64 [*] of the training transitions of successful episodes; raises DatasetError where there are none."""
+        if len(self.rewarded) == 0:
+            raise DatasetError("the dataset has no successful episode to clone; expected at least one with a reward of 1. "
+                               "Collect or label some successes, or set `clone_steps` to 0.")
+        return self.transitions[torch.isin(self.first[self.transitions], self.first[self.rewarded])]
+
     def _draw(self, positions: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """`count` of the positions without repetition, or all of them where they are no more or `count` is 0."""
         everything = positions.reshape(-1)

@@ -39,7 +39,10 @@ class Spaces:
 
 
 class LatentModel(nn.Module):
-    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1. Actions are in [-1, 1] inside; `to_env` and `to_unit` convert."""
+    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1, and a policy cloned from successes where the config has one.
+
+    Actions are in [-1, 1] inside; `to_env` and `to_unit` convert.
+    """
 
     def __init__(self, config: ModelConfig, spaces: Spaces, discount: float, precision: Precision = "float32") -> None:
         super().__init__()
@@ -52,6 +55,7 @@ class LatentModel(nn.Module):
         self.global_policy = Policy(latent, config.policy_dense, action, norm)
         self.local_critics = EnsembleMLP(config.n_ens, 2 * latent + action, config.critic_dense, norm)
         self.global_critic = EnsembleMLP(config.n_global, latent + action, config.critic_dense, norm)
+        self.success_policy = Policy(latent, config.policy_dense, action, norm) if config.success_policy else None
         if config.critic_bounded:
             for critic in (self.local_critics, self.global_critic):
                 nn.init.constant_(critic.biases[-1], UNREWARDED)
@@ -156,7 +160,7 @@ class LatentModel(nn.Module):
             "step_distance": step_distance,
         }
 
-    def _fast_functions(self, hidden: Precision | None) -> dict[str, Callable[..., Any]]:
+    def _fast_functions(self, hidden: Precision | None) -> dict[str, Callable[..., Any] | None]:
         """h, g, π^g, Q^l and Q^g as the search calls them."""
         decoder, local_policy = joined(self.action_model.decoder), joined(self.local_policy)
         local_critics = joined(self.local_critics)
@@ -164,6 +168,7 @@ class LatentModel(nn.Module):
         dynamics, global_policy = joined(self.dynamics, dtype), joined(self.global_policy, dtype)
         global_critic = joined(self.global_critic, dtype)
         residual, bound = self.config.dynamics_residual, self.bound
+        cloned = None if self.success_policy is None else joined(self.success_policy)
 
         def step(latent: Tensor, action: Tensor) -> Tensor:
             change = dynamics(latent, action)
@@ -182,6 +187,7 @@ class LatentModel(nn.Module):
         return {
             "propose": lambda latent, noise: decoder(latent, noise).tanh_(),
             "act_global": act_global,
+            "act_success": None if cloned is None else lambda latent: cloned(latent).tanh_(),
             "step": step,
             "reach": reach,
             "q": global_q,

@@ -86,8 +86,8 @@ def shifted(stacks: Tensor, group: int, offsets: Tensor) -> Tensor:
 
 
 class JointLearner:
-    """Owns the model, its target critics and the optimisers; `encoder_step`, `joint_step` and `latent_step` are single
-    updates."""
+    """Owns the model, its target critics and the optimisers; `encoder_step`, `joint_step`, `latent_step` and `clone_step`
+    are single updates."""
 
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
@@ -97,6 +97,12 @@ class JointLearner:
         if config.reconstruction > 0:
             self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
         self.pairs = PairObjective(model, config, sampler, generator) if config.encoder_steps > 0 else None
+        self.clone_optimizer = None
+        if config.clone_steps > 0:
+            assert model.success_policy is not None, "clone_steps asks for success_policy"
+            self.successes = sampler.successes()
+            cloned = model.success_policy.parameters()
+            self.clone_optimizer = torch.optim.Adam(cloned, config.latent_learning_rate, fused=True)
         self.cache: Tensor | None = None
         self.updates = 0
         self._optimise(config.learning_rate, encoder=True)
@@ -123,8 +129,9 @@ class JointLearner:
     @property
     def optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Optimisers by name."""
-        pairs = {"pairs": self.pair_optimizer} if self.pair_optimizer is not None else {}
-        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **pairs}
+        extra = {"pairs": self.pair_optimizer, "clone": self.clone_optimizer}
+        kept = {name: optimizer for name, optimizer in extra.items() if optimizer is not None}
+        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **kept}
 
     def _optimise(self, learning_rate: float, encoder: bool) -> None:
         """Fresh optimisers; the encoder is left out in the latent phase."""
@@ -208,6 +215,21 @@ class JointLearner:
             values, more = self.value_loss(latents, batch)
             (dynamics + values).backward()
             return {"dynamics/loss": info["loss"], **more, **self._step(latents, batch)}
+
+    def clone_step(self) -> Info:
+        """One update of the policy cloned from successes, on cached latents: mean-squared error as in D.1 (ours)."""
+        policy, cache = self.model.success_policy, self.cache
+        assert policy is not None and cache is not None, "begin_latent_phase comes first"
+        assert self.clone_optimizer is not None, "clone_steps is 0"
+        drawn = torch.randint(len(self.successes), (self.config.latent_batch,), generator=self.generator,
+                              device=self.successes.device)
+        rows = self.successes[drawn]
+        self.clone_optimizer.zero_grad(set_to_none=True)
+        with one_thread(rows.device, len(rows) <= TRANSITIONS_A_THREAD):
+            loss = (policy(cache[rows]) - self.sampler.actions[rows]).square().mean()
+            loss.backward()
+            self.clone_optimizer.step()
+        return {"clone/loss": loss.detach()}
 
     def _threads(self, batch: Batch) -> AbstractContextManager[None]:
         """One thread for the heads while a batch is small."""

@@ -76,11 +76,13 @@ class Trainer:
 
     @property
     def phase(self) -> str:
-        """`encoder`, `joint` or `latent`."""
+        """`encoder`, `joint`, `latent` or `clone`."""
         train = self.config.train
         if self.step <= train.encoder_steps:
             return "encoder"
-        return "joint" if self.step <= train.encoder_steps + train.joint_steps else "latent"
+        if self.step <= train.encoder_steps + train.joint_steps:
+            return "joint"
+        return "latent" if self.step <= train.steps - train.clone_steps else "clone"
 
     @property
     def cadence(self) -> Cadence:
@@ -109,7 +111,7 @@ class Trainer:
     def update(self) -> dict[str, Tensor]:
         """One update of the current phase."""
         train, learner = self.config.train, self.learner
-        joint, latent = train.encoder_steps, train.encoder_steps + train.joint_steps
+        joint, latent, clone = train.encoder_steps, train.encoder_steps + train.joint_steps, train.steps - train.clone_steps
         if self.step < joint:
             learner.set_learning_rate(train.encoder_learning_rate * cosine(self.step / joint))
             info = learner.encoder_step()
@@ -117,6 +119,11 @@ class Trainer:
             rate = cosine((self.step - joint) / train.joint_steps) if train.anneal else 1.0
             learner.set_learning_rate(train.learning_rate * rate)
             info = learner.joint_step()
+        elif self.step >= clone:
+            if learner.cache is None:
+                learner.begin_latent_phase()
+            learner.set_learning_rate(train.latent_learning_rate * cosine((self.step - clone) / train.clone_steps))
+            info = learner.clone_step()
         else:
             if learner.cache is None:
                 learner.begin_latent_phase()
@@ -151,8 +158,9 @@ class Trainer:
         """
         train = older_fields("train", asdict(self.config.train))
         late = () if self.config.train.anneal else ("joint_steps",)
-        schedule = {name: train.pop(name) for name in sorted(train) if name in late or name.startswith("latent_")}
-        learned = {"task": self.config.task, "model": asdict(self.config.model), "train": train}
+        later = ("latent_", "clone_")
+        schedule = {name: train.pop(name) for name in sorted(train) if name in late or name.startswith(later)}
+        learned = {"task": self.config.task, "model": older_fields("model", asdict(self.config.model)), "train": train}
         return {
             "config": json.dumps(learned, sort_keys=True),
             SCHEDULE: json.dumps(schedule),
