@@ -304,6 +304,13 @@ class PlannerConfig:
     coherent_noise: bool = True
     """Draw the action noise once a simulation instead of once a step (the data are correlated walks). ours; off in
     `paper`."""
+    rehearsals: int = 0
+    """Walks of each of the best paths by π^l under h, with noise in the actions, that decide which one is followed; 0 trusts
+    Eq. 8. ours: a search finds leaks of h that the controller does not have."""
+    rehearsal_paths: int = 24
+    """Paths that are rehearsed with noise, the best of all by one walk without. ours."""
+    rehearsal_noise: float = 0.4
+    """Deviation of that noise [1, the largest action]. ours."""
     anchor: Anchor = "none"
     """What to do with candidates by their nearest dataset latent: nothing, reject beyond `anchor_factor`, or also snap.
     ours."""
@@ -311,7 +318,9 @@ class PlannerConfig:
     """Largest distance to a dataset latent, in upper 5-percentiles of one-step distances. ours."""
 
     def __post_init__(self) -> None:
-        for name in ("n_iter", "n_sim", "candidates", "max_neighbours"):
+        _require(self.rehearsals >= 0, "rehearsals", self.rehearsals, "0 or more walks")
+        _require(self.rehearsal_noise >= 0, "rehearsal_noise", self.rehearsal_noise, "a deviation of 0 or more")
+        for name in ("n_iter", "n_sim", "candidates", "max_neighbours", "rehearsal_paths"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("temperature_sparse", "temperature_value", "neighbour_distance_factor", "anchor_factor"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
@@ -476,6 +485,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "reconstruction_side",
         "shift",
     ),
+    "planner": ("rehearsals", "rehearsal_paths", "rehearsal_noise"),
     "controller": ("residuals", "shortcut_exponent", "lookahead_gain", "goal_lookahead", "revisit_penalty",
                    "success_rollout"),
 }

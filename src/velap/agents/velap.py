@@ -19,6 +19,7 @@ from velap.agents.revisits import Revisits
 from velap.agents.successes import SuccessRollouts
 from velap.models.horizon import q_from_steps
 from velap.search.est import plan
+from velap.search.rehearsal import rehearse
 from velap.search.types import Plan, SearchFns
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ class VelapAgent:
         self._lookahead, self._samples = config.controller.lookahead, config.controller.lookahead_samples
         self._gain, self._goal_lookahead = config.controller.lookahead_gain, config.controller.goal_lookahead
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
+        self._waypoint_exponent = config.controller.waypoint_exponent
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
         shortcut = config.controller.shortcut_exponent
         self._shortcut_value = q_from_steps(shortcut, self._fns.discount) if shortcut > 0 else None
@@ -198,7 +200,10 @@ class VelapAgent:
         """Plan for the rows `planned` [P] from `latents` [B, D] together."""
         rows = torch.from_numpy(planned).to(self._device)
         start = time.perf_counter()
-        result = plan(fns, latents[rows], self._planner, [self._generators[row] for row in planned])
+        generators = [self._generators[row] for row in planned]
+        result = plan(fns, latents[rows], self._planner, generators)
+        if self._planner.rehearsals > 0:
+            result = rehearse(fns, result, self._planner, self._waypoint_exponent, generators)
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         self.last_plan_ms[planned] = (time.perf_counter() - start) * 1e3 / len(planned)

@@ -177,8 +177,11 @@ class LatentModel(nn.Module):
         def act_global(latent: Tensor) -> Tensor:
             return global_policy(latent).tanh_()
 
+        def act_local(start: Tensor, goal: Tensor) -> Tensor:
+            return local_policy(start, goal).tanh_()
+
         def reach(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-            q = bound(local_critics(start, goal, local_policy(start, goal).tanh_()))
+            q = bound(local_critics(start, goal, act_local(start, goal)))
             return q.amin(0), q.std(0, correction=0)
 
         def global_q(latent: Tensor, action: Tensor) -> Tensor:
@@ -187,6 +190,7 @@ class LatentModel(nn.Module):
         return {
             "propose": lambda latent, noise: decoder(latent, noise).tanh_(),
             "act_global": act_global,
+            "act_local": act_local,
             "act_success": None if cloned is None else lambda latent: cloned(latent).tanh_(),
             "step": step,
             "reach": reach,
