@@ -86,7 +86,7 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "latent_steps": 3_000,
         "latent_horizon": 20,
         "latent_rewarded_share": 0.0,
-        "clone_steps": 4_000,
+        "clone_steps": 8_000,
         "critic_loss": "cross_entropy",
         "policy_relative": True,
     },

@@ -122,6 +122,8 @@ class Trainer:
         elif self.step >= clone:
             if learner.cache is None:
                 learner.begin_latent_phase()
+            if self.step == clone:  # a stream of its own, so that cloning can be done again beside the same model
+                self.generator.set_state(make_generator(self.seed, stream=6, device=self.device).get_state())
             learner.set_learning_rate(train.latent_learning_rate * cosine((self.step - clone) / train.clone_steps))
             info = learner.clone_step()
         else:
