@@ -199,7 +199,11 @@ TASKS: dict[str, Task] = {
                 "planner": {"n_iter": 500, "n_sim": 10},
                 "controller": {"n_replan": 25},
             },
-            default_overrides=_SAWYER_DEFAULTS,
+            default_overrides={
+                **_SAWYER_DEFAULTS,
+                "planner": {**_SAWYER_DEFAULTS["planner"], "rehearsals": 4},
+                "controller": {**_SAWYER_DEFAULTS["controller"], "n_replan": 12},
+            },
         ),
         Task(
             name="DrawerButton",
