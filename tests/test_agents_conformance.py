@@ -189,12 +189,14 @@ def test_the_config_hash_covers_all_that_decides_the_method(checkpoint: Path, me
     _, config, _ = load_checkpoint(checkpoint)
     head = head_of(checkpoint, method)
     own = method_hash(config, method, head)
-    if method in ("velap", "td3bc", "random"):
-        assert own == config.hash()
-    else:
-        assert own not in {config.hash(), *(method_hash(config, other, head_of(checkpoint, other))
-                                            for other in METHODS if other != method)}
-    assert own != method_hash(override(config, planner={"n_iter": 7}), method, head)
+    others = {method_hash(config, other, head_of(checkpoint, other)) for other in METHODS if other != method}
+    assert own not in others
+    assert (own == config.hash()) == (method == "velap")
+    planner, model = {"planner": {"n_iter": 7}}, {"model": {"success_policy": True}, "controller": {"success_rollout": 9}}
+    for changes in (planner, model):
+        changed = method_hash(override(config, **changes), method, head)
+        assert (own != changed) == (method == "velap"), "what the tree and its controller alone act by"
+    assert own != method_hash(override(config, train={"c0": 7.0}), method, head)
     assert own == method_hash(config, method, head, method_settings(method))
     paper = dataclasses.replace(config, preset="paper")
     assert method_hash(paper, method, head) == method_hash(paper, method, head, method_settings(method, preset="paper"))

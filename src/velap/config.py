@@ -410,6 +410,13 @@ class Config:
             raw[part] = older_fields(part, raw[part])
         return json.dumps(raw, sort_keys=True)
 
+    def shared_json(self) -> str:
+        """Canonical JSON of what all methods share: without planner, controller, the policy of successes and the bank."""
+        raw = json.loads(self.to_json())
+        for part, name in (("model", "success_policy"), ("model", "bank_size"), ("train", "clone_steps")):
+            raw[part].pop(name, None)
+        return json.dumps({name: raw[name] for name in ("task", "preset", "model", "train")}, sort_keys=True)
+
     def hash(self) -> str:
         """First 12 hexadecimal digits of the SHA-256 of `to_json()`."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()[:12]

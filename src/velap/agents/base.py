@@ -85,13 +85,14 @@ def method_settings(method: str, changes: Mapping[str, Any] | None = None, prese
 def method_hash(config: Config, method: str, head: Learnt | None = None, settings: Settings | None = None) -> str:
     """The `config_hash` of a method's records: its joint config, and what else decides how it acts.
 
-    Methods that are decided by the joint config alone (velap, td3bc, random) keep that config's hash. `settings` None takes
-    those of the config's preset.
+    VELAP's is that config's own hash. The others leave out planner, controller and the policy of successes, which they have
+    no use for. `settings` None takes those of the config's preset.
     """
-    settings = settings or method_settings(method, preset=config.preset)
-    if settings is None and method not in HEADS:
+    if method == "velap":
         return config.hash()
-    parts = {"config": config.to_json(), "method": method, "settings": asdict(settings) if settings is not None else {}}
+    settings = settings or method_settings(method, preset=config.preset)
+    plain = asdict(settings) if settings is not None else {}
+    parts = {"config": config.shared_json(), "method": method, "settings": plain}
     if method in HEADS:
         if head is None:
             raise ConfigError(f"the method {method!r} acts by a head and got none; train it with `velap train TASK --method "

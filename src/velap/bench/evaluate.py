@@ -21,7 +21,7 @@ from velap.config import Config
 from velap.data.images import IMAGE_SIZE
 from velap.errors import ConfigError, UnknownTaskError
 from velap.models.heads import HEADS, AnyHead, head_path, load_head
-from velap.models.latent import WEIGHTS_SHA256, LatentModel, load_checkpoint
+from velap.models.latent import WEIGHTS_SHA256, LatentModel, load_checkpoint, shared_weights
 from velap.tasks import TASKS, get_task, make_config
 
 BATCH = 10
@@ -114,7 +114,7 @@ class _Loaded(NamedTuple):
     seed: int
     """Training seed."""
     digest: str
-    """Hash of the joint weights."""
+    """Hash of the joint weights, for other methods than VELAP of those that all share."""
     head: AnyHead | None = None
     settings: Settings | None = None
 
@@ -140,7 +140,8 @@ def _load_model(what: Evaluation) -> _Loaded:
     if what.method in HEADS:
         head = load_head(what.head or head_path(what.checkpoint, what.method), metadata, device)
     seed = int(metadata.get("seed", 0))
-    return _Loaded(model, override(config, **changes), seed, metadata[WEIGHTS_SHA256], head, settings)
+    digest = metadata[WEIGHTS_SHA256] if what.method == "velap" else shared_weights(metadata)
+    return _Loaded(model, override(config, **changes), seed, digest, head, settings)
 
 
 def make_env(env_id: str) -> gym.Env[Any, Any]:

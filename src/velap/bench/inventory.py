@@ -21,7 +21,7 @@ from velap.data import minari_io
 from velap.data.behaviours import mixture
 from velap.errors import ConfigError, RecordError
 from velap.models.heads import HEADS, head_path
-from velap.models.latent import WEIGHTS_SHA256
+from velap.models.latent import WEIGHTS_SHA256, shared_weights
 from velap.storage import run_dir
 from velap.tasks import Recipe, get_task, make_config
 from velap.training.heads import learner_config
@@ -108,7 +108,7 @@ class Inventory:
         path, total = self.head_path(cell), _expected_updates(cell)
         head = checkpoint_metadata(path)
         wanted = {"method": cell.method, "head_config": head_settings(cell)}
-        fits = (joint is not None and head is not None and head.get("joint") == joint.get(WEIGHTS_SHA256)
+        fits = (joint is not None and head is not None and head.get("joint") == shared_weights(joint)
                 and all(head.get(name) == value for name, value in wanted.items()))
         if fits and head is not None:
             return Finding(int(head["steps"]), int(head["steps"]), "updates", True, seconds=_seconds(head))
@@ -156,7 +156,7 @@ class Inventory:
         if cell.method != "random":
             joint = joint_metadata(cell.task, cell.preset, cell.seed)
         if joint is not None:
-            expected["checkpoint"] = joint[WEIGHTS_SHA256]
+            expected["checkpoint"] = joint[WEIGHTS_SHA256] if cell.method == "velap" else shared_weights(joint)
         for name, value in expected.items():
             found = {getattr(record, name) for record in records}
             if found != {value}:

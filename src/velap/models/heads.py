@@ -17,7 +17,7 @@ from velap._version import __version__
 from velap.config import Config, ModelConfig
 from velap.errors import CheckpointError, UnknownTaskError
 from velap.models.generative import ConditionalVAE
-from velap.models.latent import WEIGHTS_SHA256, restore
+from velap.models.latent import WEIGHTS_SHA256, restore, shared_weights
 from velap.models.networks import MLP, EnsembleMLP, Policy
 from velap.runs import content_sha256, load_tensors, save_tensors
 
@@ -140,7 +140,7 @@ def save_head(path: Path, head: AnyHead, joint_metadata: Mapping[str, str], prov
         "format": HEAD_FORMAT,
         "method": head.method,
         "head_config": head.settings,
-        "joint": joint_metadata[WEIGHTS_SHA256],
+        "joint": shared_weights(joint_metadata),
         "code_version": __version__,
     }
     return save_tensors(path, weights, metadata)
@@ -161,7 +161,7 @@ def load_head(path: Path | str, joint_metadata: Mapping[str, str], device: torch
         raise CheckpointError(f"{path} has format {metadata.get('format')!r} and method {method!r}; expected "
                               f"{HEAD_FORMAT!r} and one of {', '.join(HEADS)}. Give the file that `velap train --method` "
                               "wrote.")
-    own, given = metadata.get("joint", "none"), joint_metadata.get(WEIGHTS_SHA256, "none")
+    own, given = metadata.get("joint", "none"), shared_weights(joint_metadata)
     if own != given:
         raise CheckpointError(f"{path} is foreign to this joint checkpoint: it was learnt on the latents of weights "
                               f"{own[:12]}, the checkpoint has {given[:12]}. Train it again with `velap train --method "

@@ -227,14 +227,28 @@ class LatentModel(nn.Module):
 MODEL_FORMAT = "velap-latent-model/1"
 WEIGHTS_SHA256 = "weights_sha256"
 """Metadata key: hash of weights and config alone, the same for the same training however long it took."""
+SHARED_SHA256 = "shared_sha256"
+"""Metadata key: hash of the weights that heads and other methods share; see `shared_weights`."""
+OWN_WEIGHTS = ("success_policy.", "bank_")
+"""Weights that VELAP's tree and controller alone act by."""
+
+
+def shared_weights(metadata: Mapping[str, str]) -> str:
+    """What heads and the records of other methods name of a joint checkpoint: the weights without VELAP's own.
+
+    Planner, controller and the policy of successes may then change beside them. Older files have the hash of everything.
+    """
+    return metadata.get(SHARED_SHA256, metadata.get(WEIGHTS_SHA256, "none"))
 
 
 def save_checkpoint(path: Path, model: LatentModel, config: Config, provenance: Mapping[str, str]) -> str:
     """One safetensors file with weights, config and provenance (command, seed, dataset hash); returns its SHA-256."""
     weights = model.state_dict()
+    shared = {name: value for name, value in weights.items() if not name.startswith(OWN_WEIGHTS)}
     metadata = {
         **provenance,
         WEIGHTS_SHA256: content_sha256(weights, {"config": config.to_json()}),
+        SHARED_SHA256: content_sha256(shared, {"config": config.shared_json()}),
         "format": MODEL_FORMAT,
         "config": config.to_json(),
         "spaces": json.dumps(dataclasses.asdict(model.spaces)),

@@ -21,7 +21,7 @@ from velap.data.episodes import FrameStore
 from velap.data.windows import WindowSampler
 from velap.errors import CheckpointError, ConfigError
 from velap.models.heads import AnyHead
-from velap.models.latent import WEIGHTS_SHA256, LatentModel
+from velap.models.latent import LatentModel, shared_weights
 from velap.runs import load_tensors, make_generator, save_tensors
 from velap.training.joint import encode_all, evaluated
 from velap.training.loop import holdout_episodes
@@ -116,7 +116,7 @@ def latent_data(model: LatentModel, config: Config, metadata: Mapping[str, str],
 
     held_out = torch.from_numpy(rows).to(device)
     return LatentData(
-        latents=_cached_latents(model, sampler, {"joint": metadata[WEIGHTS_SHA256], "dataset": store.content_hash}, folder),
+        latents=_cached_latents(model, sampler, {"joint": shared_weights(metadata), "dataset": store.content_hash}, folder),
         actions=sampler.actions,
         rewards=sampler.rewards,
         terminated=sampler.terminated,

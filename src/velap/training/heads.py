@@ -20,7 +20,7 @@ from torch import Tensor
 from velap.data.episodes import FrameStore
 from velap.errors import CheckpointError, ConfigError, DatasetError, TrainingError, UnknownTaskError
 from velap.models.heads import AnyHead, head_path, make_head, save_head
-from velap.models.latent import WEIGHTS_SHA256, load_checkpoint
+from velap.models.latent import load_checkpoint, shared_weights
 from velap.runs import MetricsLog, load_tensors, make_generator
 from velap.threads import one_thread
 from velap.training.bc import PAPER_BC, BCConfig, BCLearner, SuccessBCLearner
@@ -190,7 +190,7 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
                            "dataset, or train the joint model again.")
     seed = int(metadata.get("seed", 0)) if seed is None else seed
     path = Path(out) if out is not None else head_path(checkpoint, method)
-    identity = {"method": method, "head_config": config.to_json(), "joint": metadata[WEIGHTS_SHA256], "seed": str(seed),
+    identity = {"method": method, "head_config": config.to_json(), "joint": shared_weights(metadata), "seed": str(seed),
                 "dataset_hash": store.content_hash}
     finished = _finished(path, identity)
     if finished is not None:
