@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from velap.bench.inventory import Inventory, Kind, job_name
+from velap.bench.inventory import Inventory, Kind, job_name, joint_metadata
 from velap.bench.matrix import Cell, everything, in_paper_order
 from velap.bench.paper import LABELS, METHODS, TABLE_1, TASKS, Published
 from velap.bench.records import Record, read_records, select
@@ -16,6 +16,7 @@ from velap.bench.statistics import Episodes, Paired, mcnemar, mean_and_spread
 from velap.bench.timings import Timings
 from velap.errors import RecordError
 from velap.models.heads import HEADS
+from velap.models.latent import WEIGHTS_SHA256, shared_weights
 from velap.tasks import PRESETS
 from velap.tasks import TASKS as REGISTERED
 
@@ -177,12 +178,21 @@ def _mixed_code(entries: Sequence[Entry]) -> list[str]:
     return notes
 
 
+def _shared(run: Run) -> str:
+    """The weights that a run's method has in common with the others; VELAP's records name its own besides."""
+    if run.cell.method == "velap":
+        metadata = joint_metadata(run.cell.task, run.cell.preset, run.cell.seed)
+        if metadata is not None and metadata.get(WEIGHTS_SHA256) == run.checkpoint:
+            return shared_weights(metadata)
+    return run.checkpoint
+
+
 def _mixed_checkpoints(entries: Sequence[Entry]) -> list[str]:
     """Methods of one task, preset and training seed that do not share their joint checkpoint."""
     checkpoints: dict[tuple[str, str, int], dict[str, list[str]]] = {}
     for run in (run for entry in entries for run in entry.runs if run.checkpoint):
         key = (run.cell.task, run.cell.preset, run.cell.seed)
-        checkpoints.setdefault(key, {}).setdefault(run.checkpoint, []).append(run.cell.method)
+        checkpoints.setdefault(key, {}).setdefault(_shared(run), []).append(run.cell.method)
     return [f"{task} {preset} seed {seed}: the methods do not share one joint checkpoint: "
             + "; ".join(f"{checkpoint[:12]} {', '.join(methods)}" for checkpoint, methods in sorted(by.items())) + "."
             for (task, preset, seed), by in checkpoints.items() if len(by) > 1]
