@@ -202,7 +202,7 @@ TASKS: dict[str, Task] = {
             default_overrides={
                 **_SAWYER_DEFAULTS,
                 "planner": {**_SAWYER_DEFAULTS["planner"], "rehearsals": 4},
-                "controller": {**_SAWYER_DEFAULTS["controller"], "n_replan": 12},
+                "controller": {**_SAWYER_DEFAULTS["controller"], "n_replan": 12, "success_rollout": 0},
             },
         ),
         Task(
