@@ -179,20 +179,25 @@ def _mixed_code(entries: Sequence[Entry]) -> list[str]:
 
 
 def _shared(run: Run) -> str:
-    """The weights that a run's method has in common with the others; VELAP's records name its own besides."""
-    if run.cell.method == "velap":
-        metadata = joint_metadata(run.cell.task, run.cell.preset, run.cell.seed)
-        if metadata is not None and metadata.get(WEIGHTS_SHA256) == run.checkpoint:
-            return shared_weights(metadata)
-    return run.checkpoint
+    """The weights that a run's method has in common with the others; empty where the checkpoint that could tell is not here.
+
+    VELAP's records name all of its weights, some of which are its own.
+    """
+    if run.cell.method != "velap":
+        return run.checkpoint
+    metadata = joint_metadata(run.cell.task, run.cell.preset, run.cell.seed)
+    if metadata is None:
+        return ""
+    return shared_weights(metadata) if metadata.get(WEIGHTS_SHA256) == run.checkpoint else run.checkpoint
 
 
 def _mixed_checkpoints(entries: Sequence[Entry]) -> list[str]:
     """Methods of one task, preset and training seed that do not share their joint checkpoint."""
     checkpoints: dict[tuple[str, str, int], dict[str, list[str]]] = {}
-    for run in (run for entry in entries for run in entry.runs if run.checkpoint):
-        key = (run.cell.task, run.cell.preset, run.cell.seed)
-        checkpoints.setdefault(key, {}).setdefault(_shared(run), []).append(run.cell.method)
+    for run in (run for entry in entries for run in entry.runs):
+        key, weights = (run.cell.task, run.cell.preset, run.cell.seed), _shared(run)
+        if weights:
+            checkpoints.setdefault(key, {}).setdefault(weights, []).append(run.cell.method)
     return [f"{task} {preset} seed {seed}: the methods do not share one joint checkpoint: "
             + "; ".join(f"{checkpoint[:12]} {', '.join(methods)}" for checkpoint, methods in sorted(by.items())) + "."
             for (task, preset, seed), by in checkpoints.items() if len(by) > 1]
