@@ -226,6 +226,7 @@ def test_rows_are_led_by_the_policy_of_successes_each_for_itself() -> None:
     agent = VelapAgent(ToyModel(act_success=round_the_wall), config)
     agent.act(frames_at(START, (-1.0, 8.0), (9.0, 9.0)))
     assert agent.planned_rows.tolist() == [0], "too far in the first, near enough in the others"
+    assert agent.led_by_success.tolist() == [False, True, True]
 
 
 def test_a_model_without_a_policy_of_successes_is_refused() -> None:

@@ -52,6 +52,8 @@ class VelapAgent:
         """[B] Q^g of the last states, less what standing there before has cost (`revisit_penalty`) [Q-value]."""
         self.near_goal: NDArray[np.bool_] = np.empty(0, bool)
         """[B] rows that π^g led in the last `act` because the goal was near."""
+        self.led_by_success: NDArray[np.bool_] = np.empty(0, bool)
+        """[B] rows that the policy cloned from successes led in the last `act`."""
         self._model = model
         self._fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
         self._planner = config.planner
@@ -118,6 +120,7 @@ class VelapAgent:
         near_goal = values > self._stop_value
         self.last_values, self.near_goal = values.float().cpu().numpy(), near_goal.cpu().numpy()
         led = self._successes.lead(latents) if self._successes is not None else None
+        self.led_by_success = np.zeros(len(latents), bool) if led is None else led.arrives.cpu().numpy()
         self._replan(latents, (self._plan_age >= self._n_replan) & ~(near_goal if led is None else near_goal | led.arrives))
         self._advance(latents)
         self._plan_age += 1
