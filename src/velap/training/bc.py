@@ -13,7 +13,7 @@ from torch import Tensor
 from velap.errors import DatasetError
 from velap.models.heads import PolicyHead
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
-from velap.training.losses import Info
+from velap.training.losses import Info, cloning_error
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,6 @@ PAPER_BC = BCConfig(steps=300_000, batch=128, learning_rate=3e-4, cosine=False, 
 """D.1."""
 LEAST_STEPS = 50
 """Updates that `passes` leaves at least. ours."""
-
-
-def cloning_error(action: Tensor, data_action: Tensor) -> Tensor:
-    """Squared error [B] of actions [B, A], averaged over A as in `losses.policy_loss`."""
-    return (action - data_action).square().mean(-1)
 
 
 class BCLearner(FrozenLearner[BCConfig, PolicyHead]):

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from velap.models.heads import IQLHead
-from velap.training.bc import cloning_error
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
 from velap.training.joint import evaluated
-from velap.training.losses import Info, polyak, td_target
+from velap.training.losses import Info, cloning_error, polyak, td_target
 from velap.training.steps import cosine
 
 

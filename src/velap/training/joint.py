@@ -22,6 +22,7 @@ from velap.threads import one_thread
 from velap.training.losses import (
     Info,
     action_model_loss,
+    cloning_error,
     critic_loss,
     cross_entropy_critic_loss,
     infonce_loss,
@@ -226,7 +227,7 @@ class JointLearner:
         rows = self.successes[drawn]
         self.clone_optimizer.zero_grad(set_to_none=True)
         with one_thread(rows.device, len(rows) <= TRANSITIONS_A_THREAD):
-            loss = (policy(cache[rows]) - self.sampler.actions[rows]).square().mean()
+            loss = cloning_error(policy(cache[rows]), self.sampler.actions[rows]).mean()
             loss.backward()
             self.clone_optimizer.step()
         return {"clone/loss": loss.detach()}

@@ -120,19 +120,22 @@ class Trainer:
             learner.set_learning_rate(train.learning_rate * rate)
             info = learner.joint_step()
         elif self.step >= clone:
-            if learner.cache is None:
-                learner.begin_latent_phase()
+            self._freeze()
             if self.step == clone:  # a stream of its own, so that cloning can be done again beside the same model
                 self.generator.set_state(make_generator(self.seed, stream=6, device=self.device).get_state())
             learner.set_learning_rate(train.latent_learning_rate * cosine((self.step - clone) / train.clone_steps))
             info = learner.clone_step()
         else:
-            if learner.cache is None:
-                learner.begin_latent_phase()
+            self._freeze()
             learner.set_learning_rate(train.latent_learning_rate * cosine((self.step - latent) / max(train.latent_steps, 1)))
             info = learner.latent_step()
         self.step += 1
         return info
+
+    def _freeze(self) -> None:
+        """The phases after the joint one work on cached latents."""
+        if self.learner.cache is None:
+            self.learner.begin_latent_phase()
 
     def report(self) -> dict[str, float]:
         """Diagnostics on held-out episodes."""

@@ -46,6 +46,11 @@ def cross_entropy_critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> tupl
     return loss, {"loss": loss.detach(), "q": weighted_mean(q.detach(), weight)}
 
 
+def cloning_error(action: Tensor, data_action: Tensor) -> Tensor:
+    """Squared error [*] of actions [*, A], averaged over A as TD3-BC does."""
+    return (action - data_action).square().mean(-1)
+
+
 def policy_loss(
     q: Tensor, action: Tensor, data_action: Tensor, imitation: float, weight: Tensor, *, relative: bool = False
 ) -> tuple[Tensor, Info]:
@@ -53,7 +58,7 @@ def policy_loss(
 
     With `relative` (ours) Q counts in its own size, so that steps count alike far from the goal and near it.
     """
-    cloning = weighted_mean((action - data_action).square().mean(-1), weight)
+    cloning = weighted_mean(cloning_error(action, data_action), weight)
     loss = imitation * cloning - weighted_mean(q / q.detach().clamp(min=Q_FLOOR) if relative else q, weight)
     return loss, {"loss": loss.detach(), "imitation": cloning.detach()}
 

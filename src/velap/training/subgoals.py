@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from velap.models.heads import SubgoalHead
-from velap.training.bc import cloning_error
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
-from velap.training.losses import Info, action_model_loss, reparameterise
+from velap.training.losses import Info, action_model_loss, cloning_error, reparameterise
 
 
 @dataclass(frozen=True)
