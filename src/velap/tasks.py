@@ -154,7 +154,14 @@ TASKS: dict[str, Task] = {
             # Tables 7-9 give it the values that most tasks have: c1 = 0.01, n_iter 250, n_sim 5, n_replan 15
             overrides={"model": {"frame_stack": 1}},
             default_overrides={
-                "train": {"c1": 0.02, "rewarded_share": 0.01},
+                "train": {
+                    "c1": 0.02,
+                    "rewarded_share": 0.01,
+                    "encoder_steps": 3_000,
+                    "reconstruction_side": 32,
+                    "critic_loss": "cross_entropy",
+                    "policy_relative": True,
+                },
                 "planner": {
                     "n_iter": 500,
                     "discard_low_exponent": 10.0,
