@@ -180,6 +180,22 @@ class TrainConfig:
     latent_rewarded_share: float | None = None
     """`rewarded_share` of the latent phase; None takes that one. ours: an encoder has to see rewards to tell them apart, but
     a share beyond chance makes states that look like rewarded ones too valuable."""
+    latent_dynamics_steps: int = 0
+    """Updates of h alone after the latent phase, on short rollouts from all over the data; 0 has none [steps]. ours: long
+    rollouts are few transitions an update, and h needs many."""
+    latent_dynamics_batch: int = 512
+    """Rollouts a batch of those. ours."""
+    latent_dynamics_horizon: int = 3
+    """Their length [steps]. ours."""
+    latent_priority: float = 0.5
+    """Half of them are drawn by the last error there to this power; 0 draws all uniformly. ours: contacts are rare."""
+    latent_ridge: float = 0.1
+    """Share of the mean variance that is added to every direction's before one-step changes are made white. ours."""
+    latent_value_steps: int = 0
+    """Updates of critics, policies and g alone after those of h, on cached latents; 0 has none [steps]. ours: values a
+    hundred steps from the goal take thousands of updates, and h's rollouts would cost most of them."""
+    latent_value_batch: int = 512
+    """Transitions a batch of those. ours."""
     latent_heads: bool = True
     """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
     clone_steps: int = 0
@@ -199,7 +215,7 @@ class TrainConfig:
     """Model updates between checkpoints [steps]. ours."""
 
     def __post_init__(self) -> None:
-        phases = ("encoder_steps", "joint_steps", "latent_steps", "clone_steps")
+        phases = ("encoder_steps", "joint_steps", "latent_steps", "latent_dynamics_steps", "latent_value_steps", "clone_steps")
         for name in (*phases, "value_transitions", "dynamics_rollouts"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in (
@@ -213,6 +229,9 @@ class TrainConfig:
             "group_reach",
             "latent_batch",
             "latent_horizon",
+            "latent_dynamics_batch",
+            "latent_dynamics_horizon",
+            "latent_value_batch",
             "log_every",
             "diagnose_every",
             "checkpoint_every",
@@ -220,7 +239,7 @@ class TrainConfig:
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("encoder_learning_rate", "learning_rate", "latent_learning_rate", "temperature"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        for name in ("inverse", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
+        for name in ("inverse", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight", "latent_priority", "latent_ridge"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         _require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
         _require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
@@ -258,7 +277,19 @@ class TrainConfig:
     @property
     def steps(self) -> int:
         """Updates of all phases [steps]."""
-        return self.encoder_steps + self.joint_steps + self.latent_steps + self.clone_steps
+        return sum(steps for _, steps in self.phases)
+
+    @property
+    def phases(self) -> tuple[tuple[str, int], ...]:
+        """Name and updates of every phase, in their order; all after `joint` work on a frozen encoder [steps]."""
+        return (
+            ("encoder", self.encoder_steps),
+            ("joint", self.joint_steps),
+            ("latent", self.latent_steps),
+            ("dynamics", self.latent_dynamics_steps),
+            ("values", self.latent_value_steps),
+            ("clone", self.clone_steps),
+        )
 
 
 @dataclass(frozen=True)
@@ -481,6 +512,13 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "encoder_learning_rate",
         "inverse",
         "latent_rewarded_share",
+        "latent_dynamics_steps",
+        "latent_dynamics_batch",
+        "latent_dynamics_horizon",
+        "latent_priority",
+        "latent_ridge",
+        "latent_value_steps",
+        "latent_value_batch",
         "clone_steps",
         "critic_loss",
         "policy_relative",

@@ -76,7 +76,7 @@ class TrainView:
             self._view = View(self._console, "training", progress.total).__enter__()
         self._shown = progress
         losses = "  ".join(f"{name.removeprefix('loss/')} {value:.3g}" for name, value in list(progress.info.items())[:6])
-        joint = progress.phase in ("encoder", "joint", "latent")
+        joint = progress.phase in ("encoder", "joint", "latent", "dynamics", "values", "clone")
         title = f"training, {progress.phase} phase" if joint else f"learning {progress.phase}"
         self._view.show(progress.step, losses, title)
 

@@ -33,6 +33,7 @@ from velap.training.losses import (
     td_target,
 )
 from velap.training.pairs import FrameDecoder, PairObjective
+from velap.training.transitions import TransitionObjective
 
 TRANSITIONS_A_THREAD = 512
 """Transitions of a batch up to which the heads work on one thread of a CPU. ours."""
@@ -87,8 +88,8 @@ def shifted(stacks: Tensor, group: int, offsets: Tensor) -> Tensor:
 
 
 class JointLearner:
-    """Owns the model, its target critics and the optimisers; `encoder_step`, `joint_step`, `latent_step` and `clone_step`
-    are single updates."""
+    """Owns the model, its target critics and the optimisers; `encoder_step`, `joint_step`, `latent_step`,
+    `dynamics_step`, `value_step` and `clone_step` are single updates."""
 
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
@@ -97,6 +98,7 @@ class JointLearner:
         self.decoder = None
         if config.reconstruction > 0:
             self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
+        self.transitions: TransitionObjective | None = None
         self.pairs = PairObjective(model, config, sampler, generator) if config.encoder_steps > 0 else None
         self.clone_optimizer = None
         if config.clone_steps > 0:
@@ -123,7 +125,7 @@ class JointLearner:
     @property
     def companions(self) -> dict[str, nn.Module]:
         """Target critics by name, and what is thrown away in the end."""
-        extra = {"decoder": self.decoder, "pairs": self.pairs}
+        extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions}
         kept = {name: module for name, module in extra.items() if module is not None}
         return {"local": self.local_target, "global": self.global_target, **kept}
 
@@ -217,6 +219,29 @@ class JointLearner:
             (dynamics + values).backward()
             return {"dynamics/loss": info["loss"], **more, **self._step(latents, batch)}
 
+    def dynamics_step(self) -> Info:
+        """One update of h alone, on cached latents (ours)."""
+        assert self.transitions is not None, "latent_dynamics_steps is 0, or begin_latent_phase is still to come"
+        self.model_optimizer.zero_grad(set_to_none=True)
+        with one_thread(self.cache.device, self.config.latent_dynamics_batch <= TRANSITIONS_A_THREAD):
+            loss, info = self.transitions.loss(self.model, self.generator)
+            loss.backward()
+            self.model_optimizer.step()
+        return {"dynamics/loss": info["loss"]}
+
+    def value_step(self) -> Info:
+        """One update of critics, policies and g alone, on cached latents (ours)."""
+        assert self.cache is not None, "begin_latent_phase comes first"
+        config = self.config
+        batch = self.sampler.sample(config.latent_value_batch, config.dynamics_horizon, False, self.generator,
+                                    rewarded_share=config.latent_rewarded_share)
+        latents = self.cache[batch.rows]
+        self.model_optimizer.zero_grad(set_to_none=True)
+        with self._threads(batch):
+            loss, info = self.value_loss(latents, batch)
+            loss.backward()
+            return {**info, **self._step(latents, batch)}
+
     def clone_step(self) -> Info:
         """One update of the policy cloned from successes, on cached latents: mean-squared error as in D.1 (ours)."""
         policy, cache = self.model.success_policy, self.cache
@@ -243,6 +268,8 @@ class JointLearner:
         rows = self.sampler.transitions
         self.step_square = (self.cache[rows + 1] - self.cache[rows]).square().sum(-1).mean()
         self._optimise(self.config.latent_learning_rate, encoder=False)
+        if self.config.latent_dynamics_steps > 0:
+            self.transitions = TransitionObjective(self.config, self.sampler, self.cache)
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """For the schedule of a phase."""

@@ -76,13 +76,17 @@ class Trainer:
 
     @property
     def phase(self) -> str:
-        """`encoder`, `joint`, `latent` or `clone`."""
-        train = self.config.train
-        if self.step <= train.encoder_steps:
-            return "encoder"
-        if self.step <= train.encoder_steps + train.joint_steps:
-            return "joint"
-        return "latent" if self.step <= train.steps - train.clone_steps else "clone"
+        """Name of the phase that the last update belonged to: one of `TrainConfig.phases`."""
+        return self._phase_of(max(self.step - 1, 0))[0]
+
+    def _phase_of(self, update: int) -> tuple[str, int, int]:
+        """Name of the phase of an update, the update's number within it, and the phase's updates [steps]."""
+        within = update
+        for name, steps in self.config.train.phases:
+            if within < steps:
+                return name, within, steps
+            within -= steps
+        raise ValueError(f"update {update} is beyond the last of {self.total}")
 
     @property
     def cadence(self) -> Cadence:
@@ -111,24 +115,22 @@ class Trainer:
     def update(self) -> dict[str, Tensor]:
         """One update of the current phase."""
         train, learner = self.config.train, self.learner
-        joint, latent, clone = train.encoder_steps, train.encoder_steps + train.joint_steps, train.steps - train.clone_steps
-        if self.step < joint:
-            learner.set_learning_rate(train.encoder_learning_rate * cosine(self.step / joint))
+        phase, done, steps = self._phase_of(self.step)
+        falling = cosine(done / steps)
+        if phase == "encoder":
+            learner.set_learning_rate(train.encoder_learning_rate * falling)
             info = learner.encoder_step()
-        elif self.step < latent:
-            rate = cosine((self.step - joint) / train.joint_steps) if train.anneal else 1.0
-            learner.set_learning_rate(train.learning_rate * rate)
+        elif phase == "joint":
+            learner.set_learning_rate(train.learning_rate * (falling if train.anneal else 1.0))
             info = learner.joint_step()
-        elif self.step >= clone:
-            self._freeze()
-            if self.step == clone:  # a stream of its own, so that cloning can be done again beside the same model
-                self.generator.set_state(make_generator(self.seed, stream=6, device=self.device).get_state())
-            learner.set_learning_rate(train.latent_learning_rate * cosine((self.step - clone) / train.clone_steps))
-            info = learner.clone_step()
         else:
             self._freeze()
-            learner.set_learning_rate(train.latent_learning_rate * cosine((self.step - latent) / max(train.latent_steps, 1)))
-            info = learner.latent_step()
+            if phase == "clone" and done == 0:  # a stream of its own, so that cloning can be repeated beside the same model
+                self.generator.set_state(make_generator(self.seed, stream=6, device=self.device).get_state())
+            learner.set_learning_rate(train.latent_learning_rate * falling)
+            updates = {"latent": learner.latent_step, "dynamics": learner.dynamics_step, "values": learner.value_step,
+                       "clone": learner.clone_step}
+            info = updates[phase]()
         self.step += 1
         return info
 
