@@ -215,8 +215,8 @@ class TrainConfig:
     """Model updates between checkpoints [steps]. ours."""
 
     def __post_init__(self) -> None:
-        phases = ("encoder_steps", "joint_steps", "latent_steps", "latent_dynamics_steps", "latent_value_steps", "clone_steps")
-        for name in (*phases, "value_transitions", "dynamics_rollouts"):
+        later = ("latent_steps", "latent_dynamics_steps", "latent_value_steps", "clone_steps")
+        for name in ("encoder_steps", "joint_steps", *later, "value_transitions", "dynamics_rollouts"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in (
             "encoder_pairs",

@@ -113,9 +113,9 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
     },
 }
 """ours: the encoder first learns where things are from pairs of states, a short joint phase of small windows tells it what
-counts, then h, values and policies learn on frozen latents for long, and a policy is cloned from the successes. The search is SpiralMaze's; near the
-goal π^g, which has seen experts there, takes over, and wherever the cloned policy gets to the goal by the model, that one. A
-smaller bank keeps the checkpoint below 3 MB."""
+counts, then h, values and policies learn for long on frozen latents, and a policy is cloned from the successes. The search
+is SpiralMaze's; near the goal π^g, which has seen experts there, takes over, and wherever the cloned policy gets to the goal
+by the model, that one. A smaller bank keeps the checkpoint below 3 MB."""
 
 TASKS: dict[str, Task] = {
     task.name: task

@@ -223,7 +223,7 @@ class JointLearner:
         """One update of h alone, on cached latents (ours)."""
         assert self.transitions is not None, "latent_dynamics_steps is 0, or begin_latent_phase is still to come"
         self.model_optimizer.zero_grad(set_to_none=True)
-        with one_thread(self.cache.device, self.config.latent_dynamics_batch <= TRANSITIONS_A_THREAD):
+        with one_thread(self.transitions.metric.device, self.config.latent_dynamics_batch <= TRANSITIONS_A_THREAD):
             loss, info = self.transitions.loss(self.model, self.generator)
             loss.backward()
             self.model_optimizer.step()
