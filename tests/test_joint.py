@@ -465,6 +465,26 @@ def test_schedule_may_change_until_the_latent_phase_begins(tmp_path):
         longer.resume()
 
 
+def test_a_finished_run_can_be_given_more_phases(tmp_path):
+    more = {"latent_value_steps": 3}
+    whole, first = trainer(tmp_path / "whole", **more), trainer(tmp_path / "first")
+    for run in (whole, first):
+        while run.step < run.total:
+            run.update()
+    first.save()
+    again = trainer(tmp_path / "first", **more)
+    again.resume()
+    assert (again.step, again.total) == (12, 15)
+    while again.step < again.total:
+        again.update()
+    for (name, a), b in zip(whole.model.state_dict().items(), again.model.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    again.save()
+    for other in ({}, {"latent_value_steps": 2}, {"latent_dynamics_steps": 1, **more}, {"latent_steps": 7, **more}):
+        with pytest.raises(CheckpointError, match="schedule"):
+            trainer(tmp_path / "first", **other).resume()
+
+
 def test_weights_hash_does_not_depend_on_how_long_training_took(tmp_path):
     hashes = []
     for name, seconds in (("a", 1.0), ("b", 2.0)):

@@ -83,10 +83,9 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
         "group_reach": 8,
         "c0": 1.0,
         "c1": 0.02,
-        "latent_steps": 0,
+        "latent_steps": 3_000,
+        "latent_horizon": 20,
         "latent_rewarded_share": 0.0,
-        "latent_dynamics_steps": 8_000,
-        "latent_value_steps": 8_000,
         "clone_steps": 8_000,
         "critic_loss": "cross_entropy",
         "policy_relative": True,
@@ -113,9 +112,9 @@ _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
     },
 }
 """ours: the encoder first learns where things are from pairs of states, a short joint phase of small windows tells it what
-counts, then h, values and policies learn for long on frozen latents, and a policy is cloned from the successes. The search
-is SpiralMaze's; near the goal π^g, which has seen experts there, takes over, and wherever the cloned policy gets to the goal
-by the model, that one. A smaller bank keeps the checkpoint below 3 MB."""
+counts, the latent phase learns the rest, and a policy is cloned from the successes. The search is SpiralMaze's; near the
+goal π^g, which has seen experts there, takes over, and wherever the cloned policy gets to the goal by the model, that one. A
+smaller bank keeps the checkpoint below 3 MB."""
 
 TASKS: dict[str, Task] = {
     task.name: task
@@ -209,6 +208,7 @@ TASKS: dict[str, Task] = {
             },
             default_overrides={
                 **_SAWYER_DEFAULTS,
+                "train": {**_SAWYER_DEFAULTS["train"], "latent_value_steps": 8_000},
                 "planner": {**_SAWYER_DEFAULTS["planner"], "rehearsals": 4},
                 "controller": {**_SAWYER_DEFAULTS["controller"], "n_replan": 12, "success_rollout": 0},
             },

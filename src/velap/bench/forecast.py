@@ -48,6 +48,12 @@ SINGLE_FACTOR = 1.5
 """Joint training where the first transition of a window alone trains the values (`paper`), relative to whole windows."""
 LATENT_UPDATE_SECONDS = 0.05
 """One update of the latent phase [s]."""
+DYNAMICS_UPDATE_SECONDS = 0.017
+"""One update of h alone on frozen latents [s]."""
+VALUE_UPDATE_SECONDS = 0.029
+"""One update of critics and policies alone on frozen latents [s]."""
+CLONE_UPDATE_SECONDS = 0.005
+"""One update of the policy cloned from successes [s]."""
 HEAD_UPDATE_SECONDS = {"bc": 0.0020, "bc-success": 0.0008, "iql": 0.0115, "iql-sparse": 0.0115, "iris": 0.0095,
                        "iris-multistep": 0.0100}
 """One update of a learner on frozen latents [s]."""
@@ -118,7 +124,13 @@ def calibrated(job: Job) -> float:
         frame = FRAME_SECONDS.get(config.model.frame_stack, FRAME_SECONDS[3])
         windows = train.batch_windows * (train.window + 1) * (1.0 if train.whole_windows else SINGLE_FACTOR)
         encoded = train.encoder_steps * 2 * train.encoder_pairs + train.joint_steps * windows
-        return START_SECONDS + encoded * frame + train.latent_steps * LATENT_UPDATE_SECONDS
+        frozen = (
+            train.latent_steps * LATENT_UPDATE_SECONDS
+            + train.latent_dynamics_steps * DYNAMICS_UPDATE_SECONDS
+            + train.latent_value_steps * VALUE_UPDATE_SECONDS
+            + train.clone_steps * CLONE_UPDATE_SECONDS
+        )
+        return START_SECONDS + encoded * frame + frozen
     if job.kind == "head":
         loading = task.recipe.transitions * FRAME_LOAD_SECONDS
         return START_SECONDS + loading + job.finding.total * HEAD_UPDATE_SECONDS[job.cell.method]

@@ -154,14 +154,33 @@ class Trainer:
 
     def resume(self) -> None:
         """Continue from `state.safetensors`; raises CheckpointError when it belongs to another run."""
-        metadata = load_state(self.state_path, self.learner, self._identity())
+        identity = self._identity()
+        metadata = load_state(self.state_path, self.learner, identity)
+        self._check_schedule(json.loads(metadata[SCHEDULE]), json.loads(identity[SCHEDULE]), int(metadata["step"]))
         self.step, self.seconds = int(metadata["step"]), float(metadata["seconds"])
+
+    def _check_schedule(self, made: dict[str, object], asked: dict[str, object], step: int) -> None:
+        """Raises CheckpointError where a phase after the joint one that has begun by `step` was made with other fields.
+
+        Phases that are still to come may change: a finished run can be given more of them, to the bits of one that had them
+        from the start.
+        """
+        order = [name for name, _ in self.config.train.phases]
+        begun = order.index(self._phase_of(min(max(step - 1, 0), self.total - 1))[0])
+        if self.learner.cache is None:
+            return
+        differing = sorted(name for name in made.keys() | asked.keys() if made.get(name) != asked.get(name))
+        wrong = [name for name in differing if order.index(phase_of_field(name)) <= begun]
+        if wrong or step > self.total:
+            raise CheckpointError(f"{self.state_path} was made with another schedule: {', '.join(wrong or ['its length'])} "
+                                  f"differ, and after {step} updates their phases have begun; expected the same. Resume "
+                                  "with the same settings, or start a new run elsewhere with --out.")
 
     def _identity(self) -> dict[str, str]:
         """What must agree for a resume: everything that has had an effect on training so far.
 
         Planner and controller never have. How long the joint phase lasts (where its learning rate does not depend on it) and
-        what the latent phase does count once the latent phase has begun (`schedule`).
+        what later phases do count once they have begun (`schedule`).
         """
         train = older_fields("train", asdict(self.config.train))
         late = () if self.config.train.anneal else ("joint_steps",)
@@ -192,6 +211,13 @@ class Trainer:
         path = self.run_dir / MODEL
         digest = save_checkpoint(path, self.model, self.config, provenance)
         return TrainResult(path, digest, self.seconds, diagnostics)
+
+
+def phase_of_field(name: str) -> str:
+    """The phase that a field of the schedule belongs to; what several share belongs to the first of them."""
+    parts = {"joint": ("joint_",), "dynamics": ("latent_dynamics_", "latent_priority", "latent_ridge"),
+             "values": ("latent_value_",), "clone": ("clone_",)}
+    return next((phase for phase, prefixes in parts.items() if name.startswith(prefixes)), "latent")
 
 
 def train(

@@ -14,7 +14,7 @@ from velap.runs import load_tensors, save_tensors
 
 STATE_FORMAT = "velap-training-state/1"
 SCHEDULE = "schedule"
-"""Metadata key of what has no effect before the latent phase begins."""
+"""Metadata key of what has no effect before its phase begins: whoever resumes compares it."""
 
 
 class Learner(Protocol):
@@ -63,8 +63,7 @@ def load_state(path: Path, learner: Learner, identity: Mapping[str, str]) -> dic
     """Restore a learner and return the metadata; raises CheckpointError where `identity` differs from what was saved."""
     tensors, metadata = load_tensors(path)
     for key, value in {"format": STATE_FORMAT, **identity}.items():
-        counts = key != SCHEDULE or metadata.get("latent_phase") == "1"
-        if counts and metadata.get(key) != value:
+        if key != SCHEDULE and metadata.get(key) != value:
             raise CheckpointError(
                 f"{path} was made with another {key}: it has {_short(metadata.get(key, 'none'), value)}, this command "
                 f"has {_short(value, metadata.get(key, ''))}. Resume with the same task, preset, seed and dataset, or "
@@ -74,7 +73,9 @@ def load_state(path: Path, learner: Learner, identity: Mapping[str, str]) -> dic
     if metadata["latent_phase"] == "1":
         learner.begin_latent_phase()
     for name, module in learner.companions.items():
-        module.load_state_dict(_under(f"target/{name}/", tensors))
+        kept = _under(f"target/{name}/", tensors)
+        if kept:  # what a phase to come needs did not exist when the state was written
+            module.load_state_dict(kept)
     for name, optimizer in learner.optimizers.items():
         _restore(optimizer, _under(f"optimizer/{name}/", tensors))
     learner.generator.set_state(tensors["generator"])
