@@ -288,14 +288,18 @@ def diagnose(task: Positional[str | None] = None, checkpoint: Path | None = None
                               image_key, max_steps, _command()))
 
 
-def study(subject: Annotated[Positional[Literal["faults", "experts"]],
-                             arg(help="`faults`: kills, damage, full disks. `experts`: can the tasks be solved.")],
-          quick: bool = False, seed: int = 0, write: Path | None = None, json: Path | None = None) -> None:
-    """Try what may go wrong, on a task shrunk to seconds; or try whether each task can be solved, and not by chance.
+def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-latents"]],
+                             arg(help="`faults`: kills, damage, full disks. `experts`: can the tasks be solved. "
+                                      "`exact-latents`: what all but the encoder can do.")],
+          quick: bool = False, seed: int = 0, write: Path | None = None, json: Path | None = None,
+          task: str = "DrawerButton", settings: Settings = ()) -> None:
+    """Try what may go wrong, on a task shrunk to seconds; try whether each task can be solved, and not by chance; or train
+    and evaluate on true states instead of latents of frames.
 
     Args:
-        quick: Two kills a command instead of twenty; ten episodes a task instead of a hundred.
-        seed: Decides the moments of the kills; seed of the experts' first episode.
+        quick: Two kills a command instead of twenty; ten episodes instead of a hundred (fifty on exact latents).
+        seed: Decides the moments of the kills; seed of the experts' first episode; training seed of exact latents.
+        task: Manipulation task of exact latents.
         write: Document to write, such as docs/faults.md or docs/experts.md.
         json: Figures of the experts go to this file as well, such as results/experts.json.
     """
@@ -303,6 +307,10 @@ def study(subject: Annotated[Positional[Literal["faults", "experts"]],
         from velap.bench.study import study_faults
 
         study_faults(OUT, quick, seed, write)
+    elif subject == "exact-latents":
+        from velap.bench.exact import study_exact_latents
+
+        study_exact_latents(OUT, task, parse_settings(settings), seed, quick, json)
     else:
         from velap.bench.experts import study_experts
 

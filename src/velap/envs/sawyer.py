@@ -98,6 +98,10 @@ class Box:
 class SawyerTask(PixelTask):
     """An arm before objects whose places are the context of the episode. A subclass says what stands there, and what for."""
 
+    joints: ClassVar[tuple[str, ...]]
+    """Joints of the objects."""
+    placed: ClassVar[tuple[str, ...]]
+    """Bodies that the context puts somewhere."""
     hand_limits: ClassVar[Box]
     """Where the mocap body may go. ours: within Meta-World's limits, so that the hand stays in the camera's sight."""
 
@@ -189,6 +193,13 @@ class SawyerTask(PixelTask):
     def set_joint(self, name: str, value: float) -> None:
         """Put an object's joint to rest at a value [m or rad]."""
         self.data.joint(name).qpos, self.data.joint(name).qvel = value, 0.0
+
+    def true_state(self) -> NDArray[np.float32]:
+        """What a frame shows, in numbers: hand [3] [m], joints of the objects [m or rad], x and y of placed bodies [m], and
+        how far the fingers are open [m]. For rulers and tests; agents never see it."""
+        joints = [float(self.data.joint(name).qpos[0]) for name in self.joints]
+        places = [value for name in self.placed for value in self.model.body(name).pos[:2]]
+        return np.array([*self.agent_position(), *joints, *places, self.data.joint("r_close").qpos[0]], np.float32)
 
     @abstractmethod
     def objects(self) -> NDArray[np.float64]:

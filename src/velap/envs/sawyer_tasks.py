@@ -65,6 +65,8 @@ class WindowClose(_NearOrAnywhere):
     """Shove the sash of a window to the left by its handle (C.2.1)."""
 
     assets: ClassVar[str] = "window"
+    joints: ClassVar[tuple[str, ...]] = ("window_slide",)
+    placed: ClassVar[tuple[str, ...]] = ("window",)
     contexts = Box((-0.08, 0.75, 0.2), (0.08, 0.88, 0.2))
     """Where the window stands."""
     test_starts = Box((-0.36, 0.42, 0.08), (-0.24, 0.6, 0.22))
@@ -99,6 +101,8 @@ class FaucetClose(_NearOrAnywhere):
     """Turn the handle of a faucet to the left (C.2.2)."""
 
     assets: ClassVar[str] = "faucet"
+    joints: ClassVar[tuple[str, ...]] = ("knob_Joint_1",)
+    placed: ClassVar[tuple[str, ...]] = ("faucetBase",)
     contexts = Box((-0.05, 0.76, 0.0), (0.15, 0.85, 0.0))
     """Where the faucet stands."""
     test_starts = Box((-0.38, 0.42, 0.08), (-0.3, 0.6, 0.22))
@@ -144,6 +148,8 @@ class ButtonWall(SawyerTask):
     """Go round a wall and press the button behind it; the hand may not rise above the wall (C.2.3)."""
 
     assets: ClassVar[str] = "button-wall"
+    joints: ClassVar[tuple[str, ...]] = ("btnbox_joint",)
+    placed: ClassVar[tuple[str, ...]] = ("box", "wall")
     hand_limits = Box((-0.4, 0.34, 0.06), (0.4, 0.8, 0.16))
     """The upper limit of z keeps the finger tips 6 cm and more below the wall's top."""
     wall_half_width = 0.23
@@ -240,6 +246,8 @@ class DrawerButton(_NearOrAnywhere):
     """
 
     assets: ClassVar[str] = "drawer-button"
+    joints: ClassVar[tuple[str, ...]] = ("goal_slidey", "btnbox_joint")
+    placed: ClassVar[tuple[str, ...]] = ("drawer", "box")
     drawers = Box((-0.26, 0.86, 0.0), (-0.16, 0.92, 0.0))
     """Where the drawer stands."""
     boxes = Box((0.16, 0.86, 0.115), (0.26, 0.92, 0.115))
