@@ -161,6 +161,7 @@ TASKS: dict[str, Task] = {
                     "reconstruction_side": 32,
                     "critic_loss": "cross_entropy",
                     "policy_relative": True,
+                    "latent_value_steps": 8_000,
                 },
                 "planner": {
                     "n_iter": 500,
