@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from velap.config import TrainConfig
+
 if TYPE_CHECKING:
     from velap.bench.records import Record
     from velap.training.steps import Progress as TrainProgress
@@ -76,7 +78,7 @@ class TrainView:
             self._view = View(self._console, "training", progress.total).__enter__()
         self._shown = progress
         losses = "  ".join(f"{name.removeprefix('loss/')} {value:.3g}" for name, value in list(progress.info.items())[:6])
-        joint = progress.phase in ("encoder", "joint", "latent", "dynamics", "values", "clone")
+        joint = progress.phase in dict(TrainConfig().phases)
         title = f"training, {progress.phase} phase" if joint else f"learning {progress.phase}"
         self._view.show(progress.step, losses, title)
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
 
-import velap.envs  # noqa: F401 - registers the tasks
 from velap.agents.base import make_agent
 from velap.bench.console import View
+from velap.bench.evaluate import make_env, reset_options
 from velap.bench.rollout import FrameReader, Rollout, make_envs
 from velap.config import Config, override
 from velap.data.behaviours import mixture, run_trajectory
@@ -79,7 +79,7 @@ class States:
 
 def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: View | None = None) -> States:
     """The trajectories that `velap collect` records, step for step, without drawing; `contexts` of them all where given."""
-    env: Any = gym.make(task.env_id).unwrapped
+    env: Any = make_env(task.env_id).unwrapped
     if not hasattr(env, "true_state"):
         raise ConfigError(f"{task.name} tells no true state; expected one of the manipulation tasks.")
     env.render = env.true_state  # what the data hold in place of frames
@@ -104,7 +104,7 @@ class ExactEncoder:
     """Stands in for φ: hand, joints and places in sizes that count alike, and the hand's last two steps; zeros behind."""
 
     def __init__(self, data: States, latent_dim: int) -> None:
-        self._states, self._first = data.states, data.store.first
+        self._states = data.states
         self._latent_dim, entries = latent_dim, data.states.shape[1]
         if entries + 6 > latent_dim:
             raise ConfigError(f"config field `latent_dim` is {latent_dim}; expected at least {entries + 6} for this state.")
@@ -141,21 +141,19 @@ def learn(data: States, config: Config, seed: int, view: View | None = None) -> 
     train = dataclasses.replace(config.train, encoder_steps=0, joint_steps=0, reconstruction=0.0)
     device = torch.device("cpu")
     sampler = WindowSampler(data.store, train, config.model.frame_stack, device, np.zeros(0, np.int64))
-    space = data.store
-    spaces = Spaces(SIDE, SIDE, tuple(map(float, space.action_low)), tuple(map(float, space.action_high)))
+    store = data.store
+    spaces = Spaces(SIDE, SIDE, tuple(map(float, store.action_low)), tuple(map(float, store.action_high)))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = LatentModel(config.model, spaces, train.discount, train.precision).train()
     model.encode = ExactEncoder(data, config.model.latent_dim)  # type: ignore[method-assign]
     learner = JointLearner(model, train, sampler, make_generator(seed, stream=1, device=device))
     learner.begin_latent_phase()
-    updates = {"latent": learner.latent_step, "dynamics": learner.dynamics_step, "values": learner.value_step,
-               "clone": learner.clone_step}
     done = 0
     for phase, steps in train.phases:
         for step in range(steps):
             learner.set_learning_rate(train.latent_learning_rate * cosine(step / steps))
-            updates[phase]()
+            learner.frozen_step(phase)
             done += 1
             if view is not None:
                 view.show(done, title=f"exact latents, {phase} phase")
@@ -167,14 +165,14 @@ def learn(data: States, config: Config, seed: int, view: View | None = None) -> 
 def play(task: Task, model: LatentModel, config: Config, method: str, seeds: range, view: View | None = None) -> list[Any]:
     """Episodes of a method that sees packed states."""
     def make() -> gym.Env[Any, Any]:
-        env = gym.make(task.env_id)
+        env = make_env(task.env_id)
         world: Any = env.unwrapped
         world.render = lambda size=SIDE: pack(world.true_state())
         return env
 
     envs = make_envs(make, min(BATCH, len(seeds)))
     agent = make_agent(method, model, config, envs[0].action_space)
-    rollout = Rollout(envs, agent, FrameReader(envs[0], SIDE), reset_options={"split": "test"})
+    rollout = Rollout(envs, agent, FrameReader(envs[0], SIDE), reset_options=reset_options(envs[0]))
     episodes = []
     for episode in rollout.run(seeds):
         episodes.append(episode)

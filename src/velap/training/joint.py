@@ -257,6 +257,12 @@ class JointLearner:
             self.clone_optimizer.step()
         return {"clone/loss": loss.detach()}
 
+    def frozen_step(self, phase: str) -> Info:
+        """One update of a phase that works on a frozen encoder, by its name in `TrainConfig.phases`."""
+        updates = {"latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step,
+                   "clone": self.clone_step}
+        return updates[phase]()
+
     def _threads(self, batch: Batch) -> AbstractContextManager[None]:
         """One thread for the heads while a batch is small."""
         return one_thread(batch.start.device, len(batch.start) <= TRANSITIONS_A_THREAD)

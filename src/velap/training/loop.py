@@ -128,9 +128,7 @@ class Trainer:
             if phase == "clone" and done == 0:  # a stream of its own, so that cloning can be repeated beside the same model
                 self.generator.set_state(make_generator(self.seed, stream=6, device=self.device).get_state())
             learner.set_learning_rate(train.latent_learning_rate * falling)
-            updates = {"latent": learner.latent_step, "dynamics": learner.dynamics_step, "values": learner.value_step,
-                       "clone": learner.clone_step}
-            info = updates[phase]()
+            info = learner.frozen_step(phase)
         self.step += 1
         return info
 
