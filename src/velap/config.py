@@ -201,6 +201,10 @@ class TrainConfig:
     clone_steps: int = 0
     """Updates of the last phase, on cached latents too: the policy of `success_policy` is cloned from the transitions of
     successful episodes; 0 has none [steps]. ours."""
+    clone_candidates: int = 1
+    """Policies that share those updates, one after the other from weights of their own; the one is kept that gets to the
+    goal most often by h and Q^g from far states of the data. ours: where a clone goes from states unlike the successes is
+    luck."""
     holdout_episodes: int = 16
     """Unrewarded episodes kept out of training for the diagnostics. ours."""
     latent_learning_rate: float = 1e-3
@@ -232,6 +236,7 @@ class TrainConfig:
             "latent_dynamics_batch",
             "latent_dynamics_horizon",
             "latent_value_batch",
+            "clone_candidates",
             "log_every",
             "diagnose_every",
             "checkpoint_every",
@@ -444,7 +449,8 @@ class Config:
     def shared_json(self) -> str:
         """Canonical JSON of what all methods share: without planner, controller, the policy of successes and the bank."""
         raw = json.loads(self.to_json())
-        for part, name in (("model", "success_policy"), ("model", "bank_size"), ("train", "clone_steps")):
+        for part, name in (("model", "success_policy"), ("model", "bank_size"), ("train", "clone_steps"),
+                           ("train", "clone_candidates")):
             raw[part].pop(name, None)
         return json.dumps({name: raw[name] for name in ("task", "preset", "model", "train")}, sort_keys=True)
 
@@ -520,6 +526,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "latent_value_steps",
         "latent_value_batch",
         "clone_steps",
+        "clone_candidates",
         "critic_loss",
         "policy_relative",
         "group_windows",

@@ -194,7 +194,10 @@ TASKS: dict[str, Task] = {
             overrides={
                 "train": {"c3": 0.5},
             },
-            default_overrides=_SAWYER_DEFAULTS,
+            default_overrides={
+                **_SAWYER_DEFAULTS,
+                "train": {**_SAWYER_DEFAULTS["train"], "clone_candidates": 8},
+            },
         ),
         Task(
             name="ButtonWall",

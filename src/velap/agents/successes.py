@@ -1,6 +1,6 @@
 """Following the policy cloned from successes where, by the model, it gets to the goal (ours).
 
-B environments, V variants of the policy, D latent, A action dimension.
+B environments, D latent, A action dimension.
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ import torch
 from torch import Tensor
 
 from velap.errors import ConfigError
+from velap.models.arrivals import arrivals
 from velap.search.types import SearchFns
-
-CHECK_EVERY = 3
-"""Simulated steps from one look at Q^g to the next [steps]."""
 
 
 class Lead(NamedTuple):
@@ -43,17 +41,6 @@ class SuccessRollouts:
 
     def lead(self, latents: Tensor) -> Lead:
         """From latents [B, D]."""
-        gains = torch.tensor(self._gains, device=latents.device).view(-1, 1, 1)
-        z = latents.expand(len(gains), *latents.shape)
-        first = actions = (gains * self._policy(z)).clamp(-1, 1)
-        steps = torch.full(z.shape[:2], torch.inf, device=z.device)
-        for step in range(1, self._horizon + 1):
-            z = self._step(z, actions)
-            if step % CHECK_EVERY == 0 or step == self._horizon:
-                arrived = self._value(z) > self._goal_value
-                steps = torch.where(arrived & steps.isinf(), float(step), steps)
-                if bool((~steps.isinf()).any(0).all()):
-                    break
-            actions = (gains * self._policy(z)).clamp(-1, 1)
-        soonest, variant = steps.min(0)
-        return Lead(~soonest.isinf(), first[variant, torch.arange(len(latents), device=z.device)])
+        found = arrivals(self._policy, self._step, self._value, latents, self._goal_value, self._horizon, self._gains)
+        soonest, variant = found.steps.min(0)
+        return Lead(~soonest.isinf(), found.first[variant, torch.arange(len(latents), device=latents.device)])

@@ -17,6 +17,7 @@ from velap.agents.base import masked_seeds
 from velap.agents.residuals import Residuals, Step
 from velap.agents.revisits import Revisits
 from velap.agents.successes import SuccessRollouts
+from velap.models.arrivals import GAINS
 from velap.models.horizon import q_from_steps
 from velap.search.est import plan
 from velap.search.rehearsal import rehearse
@@ -35,9 +36,6 @@ class VelapAgent:
     """
 
     method = "velap"
-    GOAL_GAINS = (1.0, 1.5, 2.5)
-    """How much stronger than π^g, or the policy cloned from successes, says the actions are that compete with its own,
-    before they are cut to the limits."""
 
     def __init__(self, model: LatentModel, config: Config) -> None:
         self.frame_stack = config.model.frame_stack
@@ -69,7 +67,7 @@ class VelapAgent:
         self._successes: SuccessRollouts | None = None
         if config.controller.success_rollout > 0:
             goal_value = q_from_steps(config.planner.goal_exponent, self._fns.discount)
-            self._successes = SuccessRollouts(self._fns, config.controller.success_rollout, goal_value, self.GOAL_GAINS)
+            self._successes = SuccessRollouts(self._fns, config.controller.success_rollout, goal_value, GAINS)
         self._residuals: Residuals | None = None
         if config.controller.residuals:
             self._residuals = Residuals(config.controller.residuals, self._fns.step, self._fns.step_distance)
@@ -164,7 +162,7 @@ class VelapAgent:
         policy = self._model.act_global(latents)
         if self._goal_lookahead == 0:
             return policy
-        gains = torch.tensor(self.GOAL_GAINS, device=policy.device).view(-1, 1)
+        gains = torch.tensor(GAINS, device=policy.device).view(-1, 1)
         actions = (gains * policy.unsqueeze(1)).clamp(-1, 1)
         ends = self._held(latents, actions, self._fns.step, self._goal_lookahead)
         return actions[torch.arange(len(actions), device=actions.device), self._fns.value(ends).argmax(1)]

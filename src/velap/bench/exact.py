@@ -36,7 +36,6 @@ from velap.runs import make_generator, write_atomic
 from velap.tasks import Task, get_task, make_config
 from velap.training.diagnostics import measure_latents
 from velap.training.joint import JointLearner
-from velap.training.steps import cosine
 
 EPISODES, QUICK_EPISODES, FIRST_SEED = 50, 10, 1000
 """Validation episodes."""
@@ -152,8 +151,7 @@ def learn(data: States, config: Config, seed: int, view: View | None = None) -> 
     done = 0
     for phase, steps in train.phases:
         for step in range(steps):
-            learner.set_learning_rate(train.latent_learning_rate * cosine(step / steps))
-            learner.frozen_step(phase)
+            learner.frozen_step(phase, step, steps)
             done += 1
             if view is not None:
                 view.show(done, title=f"exact latents, {phase} phase")

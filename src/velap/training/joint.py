@@ -19,6 +19,7 @@ from velap.config import TrainConfig
 from velap.data.windows import Batch, WindowSampler
 from velap.models.latent import LatentModel
 from velap.threads import one_thread
+from velap.training.clones import Clones, fresh
 from velap.training.losses import (
     Info,
     action_model_loss,
@@ -33,6 +34,7 @@ from velap.training.losses import (
     td_target,
 )
 from velap.training.pairs import FrameDecoder, PairObjective
+from velap.training.steps import cosine
 from velap.training.transitions import TransitionObjective
 
 TRANSITIONS_A_THREAD = 512
@@ -100,12 +102,12 @@ class JointLearner:
             self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
         self.transitions: TransitionObjective | None = None
         self.pairs = PairObjective(model, config, sampler, generator) if config.encoder_steps > 0 else None
-        self.clone_optimizer = None
+        self.clone_optimizer, self.clones = None, None
         if config.clone_steps > 0:
             assert model.success_policy is not None, "clone_steps asks for success_policy"
             self.successes = sampler.successes()
-            cloned = model.success_policy.parameters()
-            self.clone_optimizer = torch.optim.Adam(cloned, config.latent_learning_rate, fused=True)
+            self.clone_optimizer = self._optimise_clone()
+            self.clones = Clones(model.success_policy) if config.clone_candidates > 1 else None
         self.cache: Tensor | None = None
         self.updates = 0
         self._optimise(config.learning_rate, encoder=True)
@@ -125,7 +127,8 @@ class JointLearner:
     @property
     def companions(self) -> dict[str, nn.Module]:
         """Target critics by name, and what is thrown away in the end."""
-        extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions}
+        extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions,
+                 "clones": self.clones}
         kept = {name: module for name, module in extra.items() if module is not None}
         return {"local": self.local_target, "global": self.global_target, **kept}
 
@@ -147,6 +150,11 @@ class JointLearner:
         self.policy_parameters = [p for part in acting for p in part.parameters()]
         self.model_optimizer = torch.optim.Adam(self.model_parameters, learning_rate, fused=True)
         self.policy_optimizer = torch.optim.Adam(self.policy_parameters, learning_rate, fused=True)
+
+    def _optimise_clone(self) -> torch.optim.Optimizer:
+        """A fresh optimiser for the policy cloned from successes."""
+        assert self.model.success_policy is not None, "clone_steps asks for success_policy"
+        return torch.optim.Adam(self.model.success_policy.parameters(), self.config.latent_learning_rate, fused=True)
 
     def encoder_step(self) -> Info:
         """One update of the encoder alone, on pairs of states (ours)."""
@@ -242,11 +250,18 @@ class JointLearner:
             loss.backward()
             return {**info, **self._step(latents, batch)}
 
-    def clone_step(self) -> Info:
-        """One update of the policy cloned from successes, on cached latents: mean-squared error as in D.1 (ours)."""
+    def clone_step(self, done: int, steps: int) -> Info:
+        """Update `done` of the `steps` that clone policies from successes, on cached latents: mean-squared error as in D.1
+        (ours). The last one leaves the best of `clone_candidates` in the model."""
         policy, cache = self.model.success_policy, self.cache
         assert policy is not None and cache is not None, "begin_latent_phase comes first"
+        part = -(-steps // self.config.clone_candidates)
+        if self.clones is not None and done % part == 0:
+            fresh(policy, self.generator)
+            self.clone_optimizer = self._optimise_clone()
         assert self.clone_optimizer is not None, "clone_steps is 0"
+        length = min(part, steps - done // part * part)
+        self.set_learning_rate(self.config.latent_learning_rate * cosine(done % part / length))
         drawn = torch.randint(len(self.successes), (self.config.latent_batch,), generator=self.generator,
                               device=self.successes.device)
         rows = self.successes[drawn]
@@ -255,13 +270,21 @@ class JointLearner:
             loss = cloning_error(policy(cache[rows]), self.sampler.actions[rows]).mean()
             loss.backward()
             self.clone_optimizer.step()
-        return {"clone/loss": loss.detach()}
+        info = {"clone/loss": loss.detach()}
+        if self.clones is not None and (done % part == part - 1 or done == steps - 1):
+            with evaluated(self.model):
+                rate = self.clones.judge(self.model, cache, self.sampler.transitions, self.generator)
+            info["clone/arrival_rate"] = torch.tensor(rate)
+            if done == steps - 1:
+                policy.load_state_dict(self.clones.best.state_dict())
+        return info
 
-    def frozen_step(self, phase: str) -> Info:
-        """One update of a phase that works on a frozen encoder, by its name in `TrainConfig.phases`."""
-        updates = {"latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step,
-                   "clone": self.clone_step}
-        return updates[phase]()
+    def frozen_step(self, phase: str, done: int, steps: int) -> Info:
+        """Update `done` of the `steps` of a phase that works on a frozen encoder, by its name in `TrainConfig.phases`."""
+        if phase == "clone":
+            return self.clone_step(done, steps)
+        self.set_learning_rate(self.config.latent_learning_rate * cosine(done / steps))
+        return {"latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step}[phase]()
 
     def _threads(self, batch: Batch) -> AbstractContextManager[None]:
         """One thread for the heads while a batch is small."""

@@ -127,8 +127,7 @@ class Trainer:
             self._freeze()
             if phase == "clone" and done == 0:  # a stream of its own, so that cloning can be repeated beside the same model
                 self.generator.set_state(make_generator(self.seed, stream=6, device=self.device).get_state())
-            learner.set_learning_rate(train.latent_learning_rate * falling)
-            info = learner.frozen_step(phase)
+            info = learner.frozen_step(phase, done, steps)
         self.step += 1
         return info
 
