@@ -80,6 +80,8 @@ def test_every_candidate_begins_anew_and_the_best_one_ends_in_the_model(tmp_path
         if step % 3 == 0:
             begun.append(state["0.weight"])
             assert len(run.learner.clone_optimizer.state) and run.learner.clone_optimizer.param_groups[0]["lr"] == 1e-3
+            moments = next(iter(run.learner.clone_optimizer.state.values()))
+            assert float(moments["step"]) == 1, "an optimiser of its own"
         assert ("clone/arrival_rate" in info) == (step % 3 == 2)
         if step % 3 == 2:
             kept.append(state)
