@@ -101,6 +101,41 @@ def train_frames_per_s_stack3(device: torch.device) -> Measurement:
     return _train_frames_per_s(device, ModelConfig().frame_stack)
 
 
+def train_minutes(device: torch.device) -> Measurement:
+    """A whole training of WindowClose, the sum over its phases of updates over measured rate; on CUDA against the same
+    updates without graphs."""
+    keep_freed_memory()
+    sides, settings = (True, False) if device.type == "cuda" else (False,), make_config("WindowClose")
+    minutes: list[float] = []
+    for graphs in sides:
+        with TemporaryDirectory() as folder:
+            trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
+            trainer.learner.graphs = graphs
+            minutes.append(sum(_phase_minutes(trainer, name, device) for name, steps in settings.train.phases if steps))
+    phases = ", ".join(f"{steps} {name}" for name, steps in settings.train.phases if steps)
+    without = minutes[1] if len(minutes) > 1 else None
+    return Measurement(minutes[0], "min", f"without CUDA graphs; updates: {phases}", without)
+
+
+def _phase_minutes(trainer: Trainer, phase: str, device: torch.device, warm: int = 16, most: float = 6.0) -> float:
+    """Minutes that a phase takes, by the rate of its first updates after `warm` ones, measured for at most `most` [s]."""
+    before = 0
+    for name, steps in trainer.config.train.phases:
+        if name == phase:
+            break
+        before += steps
+    trainer.step = before
+    for _ in range(warm if device.type == "cuda" else 2):
+        trainer.update()
+    began, count = time.perf_counter(), 0
+    while count < 200 and time.perf_counter() - began < most:
+        trainer.update()
+        count += 1
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return steps * (time.perf_counter() - began) / count / 60
+
+
 def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
     """Joint updates against the forward and backward pass of the encoder alone on frames that lie ready."""
     keep_freed_memory()

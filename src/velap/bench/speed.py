@@ -45,6 +45,7 @@ class Benchmark:
 BENCHMARKS: dict[str, Benchmark] = {
     "train_frames_per_s": Benchmark(benchmarks.train_frames_per_s, at_least=0.8),
     "train_frames_per_s_stack3": Benchmark(benchmarks.train_frames_per_s_stack3, at_least=0.8),
+    "train_minutes": Benchmark(benchmarks.train_minutes),
     "plan_latency_1": Benchmark(benchmarks.plan_latency_1, at_most=1 / 50),
     "plan_latency_1_sim10": Benchmark(benchmarks.plan_latency_1_sim10, at_most=1 / 50),
     "plan_latency_64": Benchmark(benchmarks.plan_latency_64, at_most=1 / 50),

@@ -9,8 +9,9 @@ model g learns beside the policies, on fixed latents too: Eq. 2 has no term for 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +20,7 @@ from velap.config import TrainConfig
 from velap.data.windows import Batch, WindowSampler
 from velap.models.latent import LatentModel
 from velap.threads import one_thread
+from velap.training.capture import Captured, adam, set_rate
 from velap.training.clones import Clones, fresh
 from velap.training.losses import (
     Info,
@@ -110,11 +112,14 @@ class JointLearner:
             self.clones = Clones(model.success_policy) if config.clone_candidates > 1 else None
         self.cache: Tensor | None = None
         self.updates = 0
+        self.graphs = sampler.device.type == "cuda"
+        """Updates are captured as CUDA graphs."""
+        self._captured: dict[str, Captured] = {}
         self._optimise(config.learning_rate, encoder=True)
-        self.pair_optimizer = None
+        self.pair_optimizer: torch.optim.Optimizer | None = None
         if self.pairs is not None:
             learnt = [*model.encoder.parameters(), *self.pairs.parameters()]
-            self.pair_optimizer = torch.optim.Adam(learnt, config.encoder_learning_rate, fused=True)
+            self.pair_optimizer = adam(learnt, config.encoder_learning_rate)
         targets = (self.local_target, self.global_target)
         sources = (model.local_critics, model.global_critic)
         self._target_pairs = (
@@ -148,16 +153,20 @@ class JointLearner:
         self.model_parameters = [p for part in parts for p in part.parameters()]
         acting: list[nn.Module] = [model.local_policy, model.global_policy, model.action_model]
         self.policy_parameters = [p for part in acting for p in part.parameters()]
-        self.model_optimizer = torch.optim.Adam(self.model_parameters, learning_rate, fused=True)
-        self.policy_optimizer = torch.optim.Adam(self.policy_parameters, learning_rate, fused=True)
+        self.model_optimizer = adam(self.model_parameters, learning_rate)
+        self.policy_optimizer = adam(self.policy_parameters, learning_rate)
+        self._captured.clear()  # they step the old ones
 
     def _optimise_clone(self) -> torch.optim.Optimizer:
         """A fresh optimiser for the policy cloned from successes."""
         assert self.model.success_policy is not None, "clone_steps asks for success_policy"
-        return torch.optim.Adam(self.model.success_policy.parameters(), self.config.latent_learning_rate, fused=True)
+        return adam(self.model.success_policy.parameters(), self.config.latent_learning_rate)
 
     def encoder_step(self) -> Info:
         """One update of the encoder alone, on pairs of states (ours)."""
+        return self._run("encoder", self._update_encoder)
+
+    def _update_encoder(self) -> Info:
         assert self.pairs is not None and self.pair_optimizer is not None, "encoder_steps is 0"
         self.pair_optimizer.zero_grad(set_to_none=True)
         loss, info = self.pairs.loss(self.model, self.generator)
@@ -167,6 +176,9 @@ class JointLearner:
 
     def joint_step(self) -> Info:
         """One update of Eq. 2, then one of Eq. 5 and of g."""
+        return self._run_in_turn("joint", self._update_jointly, capture=self.config.shift == 0)
+
+    def _update_jointly(self, policies: bool) -> Info:
         config = self.config
         batch = self.sampler.sample(config.batch_windows, config.window, config.whole_windows, self.generator)
         self.model_optimizer.zero_grad(set_to_none=True)
@@ -190,7 +202,7 @@ class JointLearner:
             loss.backward()
         encoded.backward(latents.grad)
         with self._threads(batch):
-            return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch)}
+            return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch, policies)}
 
     def _augmented(self, stacks: Tensor, batch: Batch) -> Tensor:
         """Stacks [M, N, H, W, 3] shifted at random, each group of windows as one: what it shares stays shared."""
@@ -209,6 +221,9 @@ class JointLearner:
 
     def latent_step(self) -> Info:
         """One update on cached latents: the dynamics by rollout error, the other heads as before (when `latent_heads`)."""
+        return self._run_in_turn("latent", self._update_on_latents)
+
+    def _update_on_latents(self, policies: bool) -> Info:
         assert self.cache is not None, "begin_latent_phase comes first"
         config = self.config
         share = config.latent_rewarded_share
@@ -221,11 +236,10 @@ class JointLearner:
             if not config.latent_heads:
                 dynamics.backward()
                 self.model_optimizer.step()
-                self.updates += 1
                 return {"dynamics/loss": info["loss"]}
             values, more = self.value_loss(latents, batch)
             (dynamics + values).backward()
-            return {"dynamics/loss": info["loss"], **more, **self._step(latents, batch)}
+            return {"dynamics/loss": info["loss"], **more, **self._step(latents, batch, policies)}
 
     def dynamics_step(self) -> Info:
         """One update of h alone, on cached latents (ours)."""
@@ -239,6 +253,9 @@ class JointLearner:
 
     def value_step(self) -> Info:
         """One update of critics, policies and g alone, on cached latents (ours)."""
+        return self._run_in_turn("values", self._update_values)
+
+    def _update_values(self, policies: bool) -> Info:
         assert self.cache is not None, "begin_latent_phase comes first"
         config = self.config
         batch = self.sampler.sample(config.latent_value_batch, config.dynamics_horizon, False, self.generator,
@@ -248,7 +265,7 @@ class JointLearner:
         with self._threads(batch):
             loss, info = self.value_loss(latents, batch)
             loss.backward()
-            return {**info, **self._step(latents, batch)}
+            return {**info, **self._step(latents, batch, policies)}
 
     def clone_step(self, done: int, steps: int) -> Info:
         """Update `done` of the `steps` that clone policies from successes, on cached latents: mean-squared error as in D.1
@@ -259,9 +276,21 @@ class JointLearner:
         if self.clones is not None and done % part == 0:
             fresh(policy, self.generator)
             self.clone_optimizer = self._optimise_clone()
-        assert self.clone_optimizer is not None, "clone_steps is 0"
+            self._captured.pop("clone", None)
         length = min(part, steps - done // part * part)
         self.set_learning_rate(self.config.latent_learning_rate * cosine(done % part / length))
+        info = self._run("clone", self._update_clone)
+        if self.clones is not None and (done % part == part - 1 or done == steps - 1):
+            with evaluated(self.model):
+                rate = self.clones.judge(self.model, cache, self.sampler.transitions, self.generator)
+            info = {**info, "clone/arrival_rate": torch.tensor(rate)}
+            if done == steps - 1:
+                policy.load_state_dict(self.clones.best.state_dict())
+        return info
+
+    def _update_clone(self) -> Info:
+        policy, cache = self.model.success_policy, self.cache
+        assert policy is not None and cache is not None and self.clone_optimizer is not None, "clone_steps is 0"
         drawn = torch.randint(len(self.successes), (self.config.latent_batch,), generator=self.generator,
                               device=self.successes.device)
         rows = self.successes[drawn]
@@ -270,14 +299,7 @@ class JointLearner:
             loss = cloning_error(policy(cache[rows]), self.sampler.actions[rows]).mean()
             loss.backward()
             self.clone_optimizer.step()
-        info = {"clone/loss": loss.detach()}
-        if self.clones is not None and (done % part == part - 1 or done == steps - 1):
-            with evaluated(self.model):
-                rate = self.clones.judge(self.model, cache, self.sampler.transitions, self.generator)
-            info["clone/arrival_rate"] = torch.tensor(rate)
-            if done == steps - 1:
-                policy.load_state_dict(self.clones.best.state_dict())
-        return info
+        return {"clone/loss": loss.detach()}
 
     def frozen_step(self, phase: str, done: int, steps: int) -> Info:
         """Update `done` of the `steps` of a phase that works on a frozen encoder, by its name in `TrainConfig.phases`."""
@@ -285,6 +307,20 @@ class JointLearner:
             return self.clone_step(done, steps)
         self.set_learning_rate(self.config.latent_learning_rate * cosine(done / steps))
         return {"latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step}[phase]()
+
+    def _run_in_turn(self, name: str, update: Callable[[bool], Info], capture: bool = True) -> Info:
+        """`update(policies)`, where the policies learn in every `policy_every`-th update."""
+        self.updates += 1
+        policies = self.updates % self.config.policy_every == 0
+        return self._run(f"{name}/{policies}", partial(update, policies), capture)
+
+    def _run(self, name: str, update: Callable[[], Info], capture: bool = True) -> Info:
+        """`update()`; with `graphs` as one that is captured once for each name."""
+        if not (self.graphs and capture):
+            return update()
+        if name not in self._captured:
+            self._captured[name] = Captured(update, self.generator)
+        return self._captured[name]()
 
     def _threads(self, batch: Batch) -> AbstractContextManager[None]:
         """One thread for the heads while a batch is small."""
@@ -303,18 +339,16 @@ class JointLearner:
     def set_learning_rate(self, learning_rate: float) -> None:
         """For the schedule of a phase."""
         for optimizer in self.optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate
+            set_rate(optimizer, learning_rate)
 
-    def _step(self, latents: Tensor, batch: Batch) -> Info:
+    def _step(self, latents: Tensor, batch: Batch, policies: bool) -> Info:
         """Apply the gradients, let the targets follow, and update the policies when it is their turn. latents [M, D]."""
         self.model_optimizer.step()
-        self.updates += 1
         target, source, target_buffers, source_buffers = self._target_pairs
         polyak(target, source, self.config.target_rate)
         for old, new in zip(target_buffers, source_buffers, strict=True):
             old.copy_(new)
-        return self._update_policies(latents, batch) if self.updates % self.config.policy_every == 0 else {}
+        return self._update_policies(latents, batch) if policies else {}
 
     def value_loss(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
         """1/n Σ L_Q^l + c0 · L_Q^g of Eq. 2, with the targets of Eq. 3 and 4 from the target critics."""
