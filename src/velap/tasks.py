@@ -172,6 +172,7 @@ TASKS: dict[str, Task] = {
                     "expansion_weight": 1.0,
                     "anchor": "none",
                 },
+                "controller": {"n_replan": 2},
             },
         ),
         Task(
