@@ -116,6 +116,21 @@ def test_the_synthetic_store_has_the_shape_of_the_recipe_and_survives_a_round_tr
     assert load_store(benchmarks.DATASET).content_hash == content_hash(store)
 
 
+def test_the_minutes_of_a_training_are_updates_over_the_rate_of_their_phase() -> None:
+    class Run:
+        """The second phase takes 4 ms an update."""
+
+        config = override(make_config("WindowClose"), train={"encoder_steps": 7, "joint_steps": 6_000})
+        step = 0
+
+        def update(self) -> None:
+            assert self.step >= 7, "updates of the first phase are not its"
+            self.step += 1
+            time.sleep(0.004)
+
+    assert 0.4 <= benchmarks._phase_minutes(Run(), "joint", CPU, most=0.2) < 1.2
+
+
 def test_plan_latency_is_per_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing_released(task: str) -> Path:
         raise CheckpointError(task)
@@ -166,7 +181,8 @@ def test_peak_memory_is_this_process_alone() -> None:
 
 def test_the_acceptance_bounds() -> None:
     assert {name: (entry.at_least, entry.at_most) for name, entry in BENCHMARKS.items()} == {
-        "train_frames_per_s": (0.8, None), "train_frames_per_s_stack3": (0.8, None), "plan_latency_1": (None, 1 / 50),
+        "train_frames_per_s": (0.8, None), "train_frames_per_s_stack3": (0.8, None), "train_minutes": (None, None),
+        "plan_latency_1": (None, 1 / 50),
         "plan_latency_1_sim10": (None, 1 / 50), "plan_latency_64": (None, 1 / 50),
         "env_steps_per_s": (10, None), "sawyer_env_steps_per_s": (10, None), "collect_frames_per_s": (1, None),
         "train_rss": (None, 1)}
