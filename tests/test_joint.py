@@ -13,8 +13,9 @@ from velap.data.episodes import FrameStore
 from velap.errors import CheckpointError, ConfigError, DatasetError
 from velap.models.latent import load_checkpoint
 from velap.runs import load_tensors
-from velap.training.joint import rollouts, shifted
+from velap.training.joint import rollouts
 from velap.training.loop import MODEL, STATE, Trainer, train
+from velap.training.shifts import shifted
 
 SMALL = ModelConfig(
     frame_stack=2,

@@ -116,19 +116,23 @@ def test_the_synthetic_store_has_the_shape_of_the_recipe_and_survives_a_round_tr
     assert load_store(benchmarks.DATASET).content_hash == content_hash(store)
 
 
-def test_the_minutes_of_a_training_are_updates_over_the_rate_of_their_phase() -> None:
-    class Run:
-        """The second phase takes 4 ms an update."""
+def test_the_minutes_of_a_training_are_updates_over_the_rate_of_their_phase(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(benchmarks.time, "perf_counter", lambda: clock[0])
 
-        config = override(make_config("WindowClose"), train={"encoder_steps": 7, "joint_steps": 6_000})
+    class Run:
+        """An update of the encoder phase takes 0.1 s, one of the joint phase 0.4 s, the first of each a minute more."""
+
+        device = CPU
+        config = override(make_config("WindowClose"), train={"encoder_steps": 600, "joint_steps": 300, "latent_steps": 0,
+                                                             "clone_steps": 0})
         step = 0
 
         def update(self) -> None:
-            assert self.step >= 7, "updates of the first phase are not its"
+            clock[0] += (0.1 if self.step < 600 else 0.4) + 60 * (self.step in (0, 600))
             self.step += 1
-            time.sleep(0.004)
 
-    assert 0.4 <= benchmarks._phase_minutes(Run(), "joint", CPU, most=0.2) < 1.2
+    assert benchmarks.training_minutes(Run(), most=3.0) == pytest.approx((600 * 0.1 + 300 * 0.4) / 60)
 
 
 def test_plan_latency_is_per_environment(monkeypatch: pytest.MonkeyPatch) -> None:

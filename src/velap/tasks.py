@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from velap.config import (
+from velap.config import Config, override
+from velap.errors import UnknownTaskError
+from velap.presets import (
     DEFAULT_CONTROLLER,
     DEFAULT_TRAIN,
     ONE_SCENE,
@@ -13,10 +15,7 @@ from velap.config import (
     PAPER_MODEL,
     PAPER_PLANNER,
     PAPER_TRAIN,
-    Config,
-    override,
 )
-from velap.errors import UnknownTaskError
 
 PRESETS = ("default", "paper")
 

@@ -103,37 +103,45 @@ def train_frames_per_s_stack3(device: torch.device) -> Measurement:
 
 def train_minutes(device: torch.device) -> Measurement:
     """A whole training of WindowClose, the sum over its phases of updates over measured rate; on CUDA against the same
-    updates without graphs."""
+    updates without graphs, on a CPU against nothing."""
     keep_freed_memory()
-    sides, settings = (True, False) if device.type == "cuda" else (False,), make_config("WindowClose")
-    minutes: list[float] = []
+    settings, minutes = make_config("WindowClose"), list[float]()
+    sides = (True, False) if device.type == "cuda" else (False,)
     for graphs in sides:
         with TemporaryDirectory() as folder:
             trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
             trainer.learner.graphs = graphs
-            minutes.append(sum(_phase_minutes(trainer, name, device) for name, steps in settings.train.phases if steps))
-    phases = ", ".join(f"{steps} {name}" for name, steps in settings.train.phases if steps)
-    without = minutes[1] if len(minutes) > 1 else None
-    return Measurement(minutes[0], "min", f"without CUDA graphs; updates: {phases}", without)
+            minutes.append(training_minutes(trainer))
+    updates = ", ".join(f"{steps} {name}" for name, steps in settings.train.phases if steps)
+    name = "without CUDA graphs" if len(sides) > 1 else "none"
+    return Measurement(minutes[0], "min", f"{name}; updates: {updates}", minutes[1] if len(sides) > 1 else None)
 
 
-def _phase_minutes(trainer: Trainer, phase: str, device: torch.device, warm: int = 16, most: float = 6.0) -> float:
-    """Minutes that a phase takes, by the rate of its first updates after `warm` ones, measured for at most `most` [s]."""
-    before = 0
-    for name, steps in trainer.config.train.phases:
-        if name == phase:
-            break
-        before += steps
-    trainer.step = before
-    for _ in range(warm if device.type == "cuda" else 2):
-        trainer.update()
-    began, count = time.perf_counter(), 0
-    while count < 200 and time.perf_counter() - began < most:
-        trainer.update()
-        count += 1
+def training_minutes(trainer: Trainer, warm: int = 16, count: int = 200, most: float = 6.0) -> float:
+    """Minutes of all updates of a run, by each phase's rate: that of `count` updates after `warm` ones, or of as many as
+    `most` [s] are enough for."""
+    minutes, begins = 0.0, 0
+    for _, steps in trainer.config.train.phases:
+        if steps == 0:
+            continue
+        trainer.step = begins
+        for _ in range(min(warm, steps)):
+            trainer.update()
+        began, done = _now(trainer.device), 0
+        while done < count and (done == 0 or time.perf_counter() - began < most):
+            trainer.step = begins + min(warm, steps - 1)
+            trainer.update()
+            done += 1
+        minutes += steps * (_now(trainer.device) - began) / done / 60
+        begins += steps
+    return minutes
+
+
+def _now(device: torch.device) -> float:
+    """Seconds of a clock, once the device has done what it was given."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-    return steps * (time.perf_counter() - began) / count / 60
+    return time.perf_counter()
 
 
 def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:

@@ -23,6 +23,7 @@ from velap.errors import CheckpointError, ConfigError
 from velap.models.heads import AnyHead
 from velap.models.latent import LatentModel, shared_weights
 from velap.runs import load_tensors, make_generator, save_tensors
+from velap.training.capture import adam, set_rate
 from velap.training.joint import encode_all, evaluated
 from velap.training.loop import holdout_episodes
 from velap.training.losses import Info
@@ -214,10 +215,10 @@ class FrozenLearner(ABC, Generic[ConfigT, HeadT]):
         return {f"held_out/{name}": float(value) for name, value in info.items()}
 
     def _adam(self, *modules: nn.Module) -> torch.optim.Optimizer:
-        return torch.optim.Adam([p for m in modules for p in m.parameters()], self.config.learning_rate, fused=True)
+        return adam([p for m in modules for p in m.parameters()], self.config.learning_rate)
 
     def _set_rate(self, name: str, learning_rate: float) -> None:
-        self.optimizers[name].param_groups[0]["lr"] = learning_rate
+        set_rate(self.optimizers[name], learning_rate)
 
     def _integers(self, high: int, count: int) -> Tensor:
         """int64 [count] in [0, high)."""
