@@ -320,6 +320,17 @@ def test_a_group_of_windows_is_shifted_as_one(tmp_path, whole):
     assert torch.equal(trainer(tmp_path / "plain").learner._augmented(stacks, batch), stacks)
 
 
+def test_policies_learn_in_every_second_update_whatever_the_phase(tmp_path):
+    run = trainer(tmp_path, joint_steps=3, latent_steps=3, latent_value_steps=2, policy_every=2)
+    learnt = []
+    while run.step < run.total:
+        before = run.model.global_policy[0].weight.clone()
+        said = "global/policy" in run.update()
+        assert said != torch.equal(before, run.model.global_policy[0].weight)
+        learnt.append(said)
+    assert learnt == [False, True] * 4
+
+
 CLONED = dataclasses.replace(SMALL, success_policy=True)
 
 

@@ -128,8 +128,13 @@ def test_the_minutes_of_a_training_are_updates_over_the_rate_of_their_phase(monk
                                                              "clone_steps": 0})
         step = 0
 
+        def __init__(self) -> None:
+            self.begun: set[bool] = set()
+
         def update(self) -> None:
-            clock[0] += (0.1 if self.step < 600 else 0.4) + 60 * (self.step in (0, 600))
+            joint = self.step >= 600
+            clock[0] += (0.4 if joint else 0.1) + 60 * (joint not in self.begun)
+            self.begun.add(joint)
             self.step += 1
 
     assert benchmarks.training_minutes(Run(), most=3.0) == pytest.approx((600 * 0.1 + 300 * 0.4) / 60)
