@@ -30,9 +30,18 @@ def test_rollout_metric_loss_by_hand():
     actual = torch.zeros(2, 2, 2)
     valid = torch.tensor([[True, True], [True, False]])
     loss, rollout, info = rollout_metric_loss(predicted, actual, valid, torch.diag(torch.tensor([2.0, 1.0])), clip=10.0)
-    assert loss.item() == pytest.approx((4 + 0 + 10) / 3)  # (1 · 2)², nothing, 9² cut at 10; the last step is not real
-    assert rollout.tolist() == pytest.approx([7.0, 0.0])
+    beyond = 2 * (10 * 81) ** 0.5 - 10  # 9² is more than 10, so it counts linearly
+    assert loss.item() == pytest.approx((4 + 0 + beyond) / 3)  # (1 · 2)², nothing, 9; the last step is not real
+    assert rollout.tolist() == pytest.approx([(4 + beyond) / 2, 0.0])
     assert info["loss"] == loss
+
+
+def test_an_h_that_errs_everywhere_still_learns():
+    predicted = torch.full((3, 4, 2), 50.0, requires_grad=True)
+    valid = torch.ones(3, 4, dtype=torch.bool)
+    loss, _, _ = rollout_metric_loss(predicted, torch.zeros(3, 4, 2), valid, torch.eye(2), clip=400.0)
+    loss.backward()
+    assert (predicted.grad > 0).all()
 
 
 def frozen(tmp_path, **changes):

@@ -34,7 +34,7 @@ class TransitionObjective(nn.Module):
     """
 
     CLIP = 400.0
-    """Largest squared error of a step that counts: a jump that no model foretells is not chased. ours."""
+    """Squared error of a step from which on it counts linearly: a jump that no model foretells is not chased. ours."""
     REFRESH = 500
     """Draws between two updates of the cumulated priorities. ours: cumulating all of them costs as much as a batch."""
     LEAST, MOST = 1e-3, 100.0
