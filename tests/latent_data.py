@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from velap.config import Config, ModelConfig, TrainConfig
+from velap.config import Config, ModelConfig
 from velap.data.episodes import FrameStore
 from velap.models.latent import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.train_config import TrainConfig
 from velap.training.frozen import LatentData
 
 SMALL = ModelConfig(

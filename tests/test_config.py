@@ -7,9 +7,10 @@ import json
 
 import pytest
 
-from velap.config import Config, ControllerConfig, ModelConfig, PlannerConfig, TrainConfig, override
+from velap.config import Config, ControllerConfig, ModelConfig, PlannerConfig, override
 from velap.errors import ConfigError, UnknownTaskError
 from velap.tasks import PRESETS, TASKS, get_task, make_config
+from velap.train_config import TrainConfig
 
 
 def test_the_paper_preset_is_the_tables() -> None:

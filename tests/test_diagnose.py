@@ -33,12 +33,12 @@ from velap.bench.diagnose_model import (
 from velap.bench.diagnose_plans import Starts, plan_strip, tree_numbers
 from velap.bench.diagnose_world import distances_to, look_at_scene, stack_all
 from velap.bench.rollout import FrameReader
-from velap.config import TrainConfig
 from velap.data.episodes import Extras, FrameStore, make_store, write_dataset
 from velap.data.windows import WindowSampler
 from velap.envs.block_maze import STEP_LENGTH, SpiralMaze
 from velap.envs.sawyer_tasks import DrawerButton
 from velap.search.est import plan
+from velap.train_config import TrainConfig
 from velap.training.diagnostics import horizons
 
 DISCOUNT = 0.96

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from velap.config import Config, ModelConfig, TrainConfig
+from velap.config import Config, ModelConfig
 from velap.data.episodes import FrameStore
 from velap.errors import CheckpointError, ConfigError, DatasetError
 from velap.models.latent import load_checkpoint
 from velap.runs import load_tensors
+from velap.train_config import TrainConfig
 from velap.training.joint import rollouts
 from velap.training.loop import MODEL, STATE, Trainer, train
 from velap.training.shifts import shifted

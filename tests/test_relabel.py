@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from velap.config import TrainConfig
 from velap.data.episodes import FrameStore
 from velap.data.windows import WindowSampler
+from velap.train_config import TrainConfig
 
 
 def make_store(lengths=(4, 6, 5), rewarded=(1,)) -> FrameStore:

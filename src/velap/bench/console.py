@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from velap.config import TrainConfig
+from velap.train_config import TrainConfig
 
 if TYPE_CHECKING:
     from velap.bench.records import Record

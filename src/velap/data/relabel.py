@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from velap.config import TrainConfig
+from velap.train_config import TrainConfig
 
 
 class Relabelled(NamedTuple):

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from velap.config import TrainConfig
 from velap.data.episodes import FrameStore, stack_indices
 from velap.data.relabel import Relabelled, relabel
 from velap.errors import DatasetError
+from velap.train_config import TrainConfig
 
 
 class Batch(NamedTuple):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from velap._version import __version__
-from velap.config import Config, ModelConfig, Precision
+from velap.config import Config, ModelConfig
 from velap.errors import CheckpointError, VelapError
 from velap.models.folded import dense_layers, fold
 from velap.models.generative import ConditionalVAE
@@ -22,6 +22,7 @@ from velap.models.inference import joined, nearest_row
 from velap.models.native import native_rollout
 from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
 from velap.runs import content_sha256, load_tensors, save_tensors
+from velap.train_config import Precision
 
 UNREWARDED = -4.0
 """Initial logit of bounded critics: sparse returns start near 0; from a half they would take thousands of updates to

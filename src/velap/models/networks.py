@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from velap.config import ModelConfig, Norm, Precision
+from velap.config import ModelConfig, Norm
+from velap.train_config import Precision
 
 LEAK = 0.01
 """Negative slope of the activations (PyTorch's default; the tables say LeakyReLU only)."""

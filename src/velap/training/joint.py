@@ -16,10 +16,10 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from velap.config import TrainConfig
 from velap.data.windows import Batch, WindowSampler
 from velap.models.latent import LatentModel
 from velap.threads import one_thread
+from velap.train_config import TrainConfig
 from velap.training.capture import Captured, adam, set_rate
 from velap.training.clones import Clones, fresh
 from velap.training.losses import (

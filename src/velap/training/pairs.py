@@ -8,10 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from velap.config import TrainConfig
 from velap.data.windows import WindowSampler
 from velap.models.latent import LatentModel
 from velap.models.networks import MLP
+from velap.train_config import TrainConfig
 from velap.training.losses import Info, displacement_loss, reconstruction_loss
 
 

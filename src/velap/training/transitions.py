@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from velap.config import TrainConfig
 from velap.data.windows import WindowSampler
 from velap.models.latent import LatentModel
+from velap.train_config import TrainConfig
 from velap.training.losses import Info, rollout_metric_loss
 
 
