@@ -25,7 +25,7 @@ from velap.bench.diagnose_model import (
     Recorded,
     ValueCurve,
     album_of,
-    encode_rows,
+    encode_states,
     other_pairs,
     rank_correlation,
     rollout_error,
@@ -33,6 +33,7 @@ from velap.bench.diagnose_model import (
 from velap.bench.diagnose_plans import Starts, plan_strip, tree_numbers
 from velap.bench.diagnose_world import distances_to, look_at_scene, stack_all
 from velap.bench.rollout import FrameReader
+from velap.config import ModelConfig
 from velap.data.episodes import Extras, FrameStore, make_store, write_dataset
 from velap.data.windows import WindowSampler
 from velap.envs.block_maze import STEP_LENGTH, SpiralMaze
@@ -49,7 +50,7 @@ DRIFT = 0.1
 class LineModel(nn.Module):
     """States on a line, one apart; the brightness of a frame is the place. All exact but for dynamics that drift."""
 
-    discount, action_dim = DISCOUNT, 1
+    discount, action_dim, config = DISCOUNT, 1, ModelConfig()
 
     def __init__(self, period: float = 1e9) -> None:
         super().__init__()
@@ -57,7 +58,7 @@ class LineModel(nn.Module):
         self.period = period
         """States so far apart look the same to Q^l."""
 
-    def encode(self, frames: Tensor) -> Tensor:
+    def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
         return frames[..., -1, 0, 0, :1].float()
 
     def step(self, latent: Tensor, action: Tensor) -> Tensor:
@@ -144,7 +145,7 @@ def test_an_album_finds_the_nearest_real_state_and_holds_none_that_is_looked_at(
     frames, distances = album.nearest(torch.tensor([[60.4], [3.0]]))
     assert frames[:, 0, 0, 0].tolist() == [60, 20]
     np.testing.assert_allclose(distances, [0.4, 17], atol=1e-4)
-    assert encode_rows(model, recorded.sampler, np.array([0, 25])).tolist() == [[0.0], [24.0]]  # type: ignore[arg-type]
+    assert encode_states(model, recorded.sampler, np.array([0, 25])).tolist() == [[0.0], [24.0]]  # type: ignore[arg-type]
     assert Album("x", torch.tensor([[0.0], [1.0], [5.0]]), frames).spacing() == pytest.approx((1 + 1 + 4) / 3)
 
 
@@ -162,19 +163,22 @@ def test_shortest_ways_between_points_of_a_maze() -> None:
 class SeeingModel(nn.Module):
     """Reads the block's place off the frame; straight distances, true ways to the goal."""
 
-    discount = DISCOUNT
+    discount, action_dim, config = DISCOUNT, 2, ModelConfig()
 
     def __init__(self, world: Any) -> None:
         super().__init__()
         self.anchor, self.world = nn.Parameter(torch.zeros(1)), world
 
-    def encode(self, frames: Tensor) -> Tensor:
+    def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
         picture = frames[:, -1].float()
         blue = ((picture[..., 2] - picture[..., 0]) > 60).float()
         axis = torch.arange(64.0) + 0.5
         count = blue.sum((1, 2))
         column, row = (blue.sum(1) * axis).sum(1) / count, (blue.sum(2) * axis).sum(1) / count
         return torch.stack([column / 32 - 1, 1 - row / 32], -1)
+
+    def to_unit(self, action: Tensor) -> Tensor:
+        return action
 
     def reach(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         q = DISCOUNT ** ((goal - start).norm(dim=-1) / STEP_LENGTH)

@@ -16,7 +16,7 @@ from toy_world import GOAL, HALF_WIDTH, START, TIP, crosses_wall, move, straight
 from velap.agents.base import make_agent
 from velap.bench.evaluate import Player
 from velap.bench.records import RunKey
-from velap.config import Config, override
+from velap.config import Config, ModelConfig, override
 
 SIDE = 8
 ACTION_SCALE = 2.0
@@ -81,9 +81,9 @@ class ToyModel(nn.Module):
         self._fns = toy_fns(**changes)
         self.encoded_batches: list[int] = []
 
-    action_dim = 2
+    action_dim, config = 2, ModelConfig()
 
-    def encode(self, frames: Tensor) -> Tensor:
+    def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
         self.encoded_batches.append(len(frames))
         return read(frames)
 

@@ -26,7 +26,7 @@ class ModelConfig:
     frame_stack: int = 3
     """Frames a state N [frames]. ours: the paper leaves N open for the simulated tasks and uses 3 on hardware (E.1)."""
     latent_dim: int = 32
-    """d_Z, Table 7."""
+    """d_Z, Table 7: units of φ's output."""
     norm: Norm = "layer"
     """Normalisation of hidden layers. Tables 2-6: batch. ours: layer, no train/eval gap and no batch statistics in
     targets."""
@@ -60,6 +60,11 @@ class ModelConfig:
     """A policy cloned from successful episodes beside π^g, as BC(D*) of D.1 but in the model. ours; off in `paper`."""
     latent_norm: bool = False
     """Latents are normalised to zero mean and unit variance over their dimensions. ours; off in `paper`."""
+    command_memory: float = 0.0
+    """Share that a leaky mean of the past actions keeps at a step; with more than 0 it stands behind the output of φ, as the
+    speed of what follows commands slowly is hard to see in pixels. ours; 0 (off) in `paper`."""
+    command_scale: float = 2.0
+    """What that mean is multiplied by [latent distance]. ours."""
     bank_size: int = 4096
     """Dataset latents kept with the model for support tests and film strips; 0 keeps none. ours; 0 in `paper`."""
 
@@ -72,7 +77,13 @@ class ModelConfig:
         require(self.noise_dim >= 1, "noise_dim", self.noise_dim, "a positive number of units")
         require(self.n_ens >= 1, "n_ens", self.n_ens, "at least one critic")
         require(self.n_global >= 1, "n_global", self.n_global, "at least one critic")
+        require(0 <= self.command_memory < 1, "command_memory", self.command_memory, "at least 0 and less than 1")
+        require(self.command_scale > 0, "command_scale", self.command_scale, "a positive number")
         require(self.bank_size >= 0, "bank_size", self.bank_size, "0 or a number of latents")
+
+    def width(self, action_dim: int) -> int:
+        """D, dimensions of a latent with all that is in it."""
+        return self.latent_dim + (action_dim if self.command_memory > 0 else 0)
 
 
 @dataclass(frozen=True)
@@ -287,7 +298,7 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "model": ("success_policy",),
+    "model": ("success_policy", "command_memory", "command_scale"),
     "train": (
         "encoder_steps",
         "encoder_pairs",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from velap.agents.base import masked_seeds
+from velap.agents.states import StateEncoder
 
 if TYPE_CHECKING:
     from velap.models.latent import LatentModel
@@ -32,7 +33,7 @@ class PlanningAgent(ABC):
     def __init__(self, model: LatentModel, frame_stack: int, period: int) -> None:
         self.frame_stack = frame_stack
         self.last_plan_ms: NDArray[np.float64] = np.empty(0)
-        self._model = model
+        self._model, self._states = model, StateEncoder(model)
         self._period = period
         self._device = next(model.parameters()).device
         self._generators: list[torch.Generator] = []
@@ -46,6 +47,7 @@ class PlanningAgent(ABC):
             self._age = np.full(len(mask), self._period)
             self.last_plan_ms = np.full(len(mask), np.nan)
             self._allocate(len(mask))
+        self._states.forget(mask)
         for row, seed in masked_seeds(mask, seeds):
             self._generators[row].manual_seed(seed)
             self._forget(row)
@@ -56,7 +58,7 @@ class PlanningAgent(ABC):
         """Frames [B, N, H, W, 3] -> actions [B, A]."""
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
-        latents = self._model.encode(torch.from_numpy(frames).to(self._device))
+        latents = self._states(frames)
         self.last_plan_ms[:] = np.nan
         due = np.flatnonzero(self._age >= self._period)
         at_once = 1 if self._device.type == "cpu" else max(len(due), 1)
@@ -64,7 +66,7 @@ class PlanningAgent(ABC):
             self._timed_plan(due[start : start + at_once], latents)
         actions = self._follow(latents)
         self._age += 1
-        return self._model.to_env(actions)
+        return self._states.act(actions)
 
     def _timed_plan(self, rows: NDArray[np.int64], latents: Tensor) -> None:
         """Plan for `rows` [P] together and note each one's share of the time."""

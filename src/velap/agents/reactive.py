@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from velap.agents.base import masked_seeds
+from velap.agents.states import StateEncoder
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
@@ -53,12 +54,12 @@ class ReactiveAgent:
         self.method = method
         self.frame_stack = frame_stack
         self.last_plan_ms: NDArray[np.float64] = np.empty(0)
-        self._model = model
         self._policy = policy
-        self._device = next(model.parameters()).device
+        self._states = StateEncoder(model)
 
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
-        """Nothing to forget: the policy is a function of the state."""
+        """Forget the actions taken, where the state holds them: the policy is a function of the state."""
+        self._states.forget(mask)
         self.last_plan_ms = np.full(len(mask), np.nan)
 
     @torch.inference_mode()
@@ -66,5 +67,4 @@ class ReactiveAgent:
         """Frames [B, N, H, W, 3] -> actions [B, A]."""
         if len(frames) != len(self.last_plan_ms):
             self.reset(np.ones(len(frames), bool))
-        latents = self._model.encode(torch.from_numpy(frames).to(self._device))
-        return self._model.to_env(self._policy(latents))
+        return self._states.act(self._policy(self._states(frames)))

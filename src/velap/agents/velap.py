@@ -16,6 +16,7 @@ from torch import Tensor
 from velap.agents.base import masked_seeds
 from velap.agents.residuals import Residuals, Step
 from velap.agents.revisits import Revisits
+from velap.agents.states import StateEncoder
 from velap.agents.successes import SuccessRollouts
 from velap.models.arrivals import GAINS
 from velap.models.horizon import q_from_steps
@@ -52,7 +53,7 @@ class VelapAgent:
         """[B] rows that π^g led in the last `act` because the goal was near."""
         self.led_by_success: NDArray[np.bool_] = np.empty(0, bool)
         """[B] rows that the policy cloned from successes led in the last `act`."""
-        self._model = model
+        self._model, self._states = model, StateEncoder(model)
         self._fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
         self._planner = config.planner
         self._n_replan = config.controller.n_replan
@@ -87,6 +88,7 @@ class VelapAgent:
             self._allocate(len(mask))
         for row, seed in masked_seeds(mask, seeds):
             self._generators[row].manual_seed(seed)
+        self._states.forget(mask)
         started = torch.from_numpy(mask).to(self._device)
         self._plan_age[started] = self._n_replan
         self._length[started] = 0
@@ -109,7 +111,7 @@ class VelapAgent:
         """One step of Algorithm 2: frames [B, N, H, W, 3] -> actions [B, A]."""
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
-        latents = self._model.encode(torch.from_numpy(frames).to(self._device))
+        latents = self._states(frames)
         if self._residuals is not None:
             self._residuals.observe(latents)
         values = self._fns.value(latents)
@@ -134,7 +136,7 @@ class VelapAgent:
             actions = torch.where(led.arrives[:, None], led.actions, actions)
         if self._residuals is not None:
             self._residuals.acted(latents, actions)
-        return self._model.to_env(actions)
+        return self._states.act(actions)
 
     def _act_local(self, latents: Tensor, waypoints: Tensor) -> Tensor:
         """π^l towards `waypoints` [B, D], or the best of it and sampled actions under the dynamics: actions [B, A].

@@ -22,7 +22,7 @@ from velap.bench.diagnose_model import (
     RolloutError,
     ValueCurve,
     album_of,
-    encode_rows,
+    encode_states,
     open_recorded,
     other_pairs,
     rewarded_curves,
@@ -183,7 +183,7 @@ def _measure(console: Console, request: Request, subject: _Subject, model: Laten
     with console.status("rollouts and distances on recorded episodes"):
         rollout = rollout_error(horizons(model, recorded.sampler, recorded.spans, range(1, min(LONGEST, longest) + 1), None))
         pairs = other_pairs(model, recorded, config.train.group_reach, rng)
-        album, held_out = album_of(model, recorded, rng), encode_rows(model, recorded.sampler, recorded.rows)
+        album, held_out = album_of(model, recorded, rng), encode_states(model, recorded.sampler, recorded.rows)
     world = _World() if player is None else _look_at_world(console, request, model, player)
     starts = world.starts or _recorded_starts(recorded)
     with console.status("plans"):

@@ -23,6 +23,7 @@ from velap.models.horizon import q_from_steps, steps_from_q
 from velap.models.inference import nearest_row
 from velap.models.latent import LatentModel
 from velap.training.diagnostics import Horizon
+from velap.training.joint import encode_rows
 from velap.training.loop import holdout_episodes
 
 PAIRS = 1000
@@ -91,10 +92,10 @@ def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, co
 
 
 @torch.inference_mode()
-def encode_rows(model: LatentModel, sampler: WindowSampler, rows: NDArray[np.int64], chunk: int = 512) -> Tensor:
+def encode_states(model: LatentModel, sampler: WindowSampler, rows: NDArray[np.int64], chunk: int = 512) -> Tensor:
     """Latents [R, D] of the states at rows [R]."""
     parts = torch.from_numpy(rows).to(sampler.device).split(chunk)
-    return torch.cat([model.encode(sampler.stacks(part)) for part in parts]).float()
+    return torch.cat([encode_rows(model, sampler, part) for part in parts]).float()
 
 
 def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
@@ -166,7 +167,7 @@ def other_pairs(model: LatentModel, recorded: Recorded, reach: int, rng: np.rand
     start = rng.choice(recorded.rows, count)
     episode = store.episode_of[start]
     everything = np.arange(store.n_episodes)
-    latents, found = encode_rows(model, recorded.sampler, start), []
+    latents, found = encode_states(model, recorded.sampler, start), []
     for name, near in (("neighbouring episodes", True), ("far episodes", False)):
         choices = []
         for number in range(count):
@@ -177,7 +178,7 @@ def other_pairs(model: LatentModel, recorded: Recorded, reach: int, rng: np.rand
         if (chosen < 0).any():
             continue
         goal = store.episode_start[chosen] + rng.integers(0, store.episode_length[chosen] + 1)
-        found.append(Pairs(name, local_steps(model, latents, encode_rows(model, recorded.sampler, goal)),
+        found.append(Pairs(name, local_steps(model, latents, encode_states(model, recorded.sampler, goal)),
                            _least_steps(recorded, start, goal)))
     return found
 
@@ -238,7 +239,7 @@ def rewarded_curves(model: LatentModel, recorded: Recorded, count: int = REWARDE
     for episode in longest:
         first = int(store.episode_start[episode])
         rows = np.arange(first, first + int(store.episode_length[episode]) + 1)
-        curves.append(value_curve(model, f"episode {episode} of the data", encode_rows(model, recorded.sampler, rows)))
+        curves.append(value_curve(model, f"episode {episode} of the data", encode_states(model, recorded.sampler, rows)))
     return curves
 
 
@@ -270,4 +271,4 @@ def album_of(model: LatentModel, recorded: Recorded, rng: np.random.Generator, s
     if len(rows) == 0:
         rows = recorded.rows
     rows = np.sort(rng.choice(rows, min(size, len(rows)), replace=False))
-    return Album("the dataset", encode_rows(model, recorded.sampler, rows), recorded.store.frames[rows])
+    return Album("the dataset", encode_states(model, recorded.sampler, rows), recorded.store.frames[rows])

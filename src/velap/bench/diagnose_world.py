@@ -20,6 +20,7 @@ from velap.bench.evaluate import Player, reset_options
 from velap.bench.experts import episode
 from velap.bench.figures import can_probe, probe
 from velap.bench.rollout import FrameReader
+from velap.data.commands import past_commands
 from velap.data.episodes import stack_indices
 from velap.envs.block_maze import STEP_LENGTH
 from velap.envs.geometry import Layout, Rect
@@ -130,18 +131,25 @@ def expert_curves(model: LatentModel, env: gym.Env[Any, Any], frame_stack: int, 
     world: Any = env.unwrapped
     if not hasattr(world, "expert_action") or env.spec is None or env.spec.max_episode_steps is None:
         return []
-    device, curves = next(model.parameters()).device, []
+    device, curves, space = next(model.parameters()).device, [], world.action_space
     for seed in seeds:
         frames: list[NDArray[np.uint8]] = []
+        taken: list[NDArray[np.floating[Any]]] = []
 
-        def act(seen: list[NDArray[np.uint8]] = frames) -> NDArray[np.floating[Any]]:
+        def act(seen: list[NDArray[np.uint8]] = frames, done: list[NDArray[np.floating[Any]]] = taken
+                ) -> NDArray[np.floating[Any]]:
             seen.append(world.render())
-            return world.expert_action()
+            done.append(np.clip(world.expert_action(), space.low, space.high))
+            return done[-1]
 
         if episode(world, act, seed, env.spec.max_episode_steps) is None:
             continue
         stacks = torch.from_numpy(stack_all([*frames, world.render()], frame_stack))
+        actions = torch.from_numpy(np.stack([*taken, np.zeros_like(taken[0])]).astype(np.float32)).to(device)
         with torch.inference_mode():
-            latents = torch.cat([model.encode(part.to(device)) for part in stacks.split(512)]).float()
+            commands = past_commands(model.to_unit(actions), torch.zeros(len(actions), dtype=torch.long, device=device),
+                                     model.config.command_memory)
+            parts = zip(stacks.split(512), commands.split(512), strict=True)
+            latents = torch.cat([model.encode(part.to(device), before) for part, before in parts]).float()
         curves.append(value_curve(model, f"expert from start {seed}", latents))
     return curves

@@ -114,7 +114,7 @@ class ExactEncoder:
         scale[joints] = JOINT_SHARE * np.ptp(data.states[:, joints], axis=0)
         self._scale = np.maximum(scale, LEAST)
 
-    def __call__(self, frames: Tensor) -> Tensor:
+    def __call__(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
         """Frames of the data [*, N, 1, 1, 3] or packed states [*, N, 64, 64, 3] -> latents [*, D]."""
         pictures = frames.numpy()
         if pictures.shape[-3] == 1:
@@ -144,7 +144,8 @@ def learn(data: States, config: Config, seed: int, view: View | None = None) -> 
     spaces = Spaces(SIDE, SIDE, tuple(map(float, store.action_low)), tuple(map(float, store.action_high)))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = LatentModel(config.model, spaces, train.discount, train.precision).train()
+        blind = dataclasses.replace(config.model, command_memory=0.0)  # the true state holds the hand's speed
+        model = LatentModel(blind, spaces, train.discount, train.precision).train()
     model.encode = ExactEncoder(data, config.model.latent_dim)  # type: ignore[method-assign]
     learner = JointLearner(model, train, sampler, make_generator(seed, stream=1, device=device))
     learner.begin_latent_phase()

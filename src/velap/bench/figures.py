@@ -66,7 +66,7 @@ def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_s
     world: Any = env.unwrapped
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
-    stacks, positions = [], []
+    stacks, positions, actions = [], [], []
     env.reset(seed=seed)
     for start in world.free_positions(rng, count):
         world.set_agent_position(start)
@@ -74,10 +74,13 @@ def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_s
         frames = [read(world.step(action)[0]) for _ in range(frame_stack)]
         stacks.append(np.stack([frames[row] for row in stack_indices(np.array(frame_stack - 1), np.array(0), frame_stack)]))
         positions.append(world.agent_position()[:2])
+        actions.append(action)
     device = next(model.parameters()).device
     everything = np.stack(stacks)
-    batches = np.array_split(everything, max(1, count // 256))
-    latents = torch.cat([model.encode(torch.from_numpy(batch).to(device)) for batch in batches])
+    share = 1 - model.config.command_memory**frame_stack  # of the one action in the leaky mean
+    commands = share * model.to_unit(torch.from_numpy(np.stack(actions).astype(np.float32)).to(device))
+    batches = zip(torch.from_numpy(everything).split(256), commands.split(256), strict=True)
+    latents = torch.cat([model.encode(batch.to(device), before) for batch, before in batches])
     values = model.value(latents).float().cpu().numpy()
     return LatentMap(latents.float().cpu().numpy(), np.stack(positions), values, world.extent,
                      everything[:, -1])

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from velap.data.commands import past_commands
 from velap.data.episodes import FrameStore, stack_indices
 from velap.data.relabel import Relabelled, relabel
 from velap.errors import DatasetError
@@ -68,6 +69,7 @@ class WindowSampler:
         self.starts, self.lengths = put(store.episode_start), put(store.episode_length)
         # a row's place among the training episodes
         self.rank_of_row = put(np.searchsorted(kept, store.episode_of).clip(max=max(len(kept) - 1, 0)))
+        self._commands: dict[float, Tensor] = {}
         if len(self.transitions) == 0:
             raise DatasetError("the dataset has no transition to train on; expected episodes of at least one step.")
 
@@ -130,6 +132,12 @@ class WindowSampler:
         """Frame stacks of rows: int64 `[*] → uint8 [*, N, H, W, 3]`."""
         index = stack_indices(rows, self.first[rows], self.frame_stack)
         return self.frames.index_select(0, index.flatten()).view(*index.shape, *self.frames.shape[1:])
+
+    def commands(self, rows: Tensor, memory: float) -> Tensor:
+        """Leaky means of the actions before rows: int64 `[*] → float32 [*, A]` in [-1, 1]; see `velap.data.commands`."""
+        if memory not in self._commands:
+            self._commands[memory] = past_commands(self.actions, self.first, memory)
+        return self._commands[memory][rows]
 
     def _draw_windows(
         self, windows: int, length: int, whole: bool, rewarded_share: float, generator: torch.Generator

@@ -41,7 +41,7 @@ class PolicyHead(Head):
 
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__()
-        self.policy = Policy(config.latent_dim, config.policy_dense, action_dim, config.norm)
+        self.policy = Policy(config.width(action_dim), config.policy_dense, action_dim, config.norm)
 
     def act(self, latent: Tensor) -> Tensor:
         """π: `[*, D] → [*, A]` in [-1, 1]."""
@@ -53,8 +53,8 @@ class IQLHead(PolicyHead):
 
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__(config, action_dim)
-        self.critics = EnsembleMLP(N_CRITICS, config.latent_dim + action_dim, config.critic_dense, config.norm)
-        self.value_net = MLP(config.latent_dim, config.critic_dense, 1, config.norm)
+        self.critics = EnsembleMLP(N_CRITICS, config.width(action_dim) + action_dim, config.critic_dense, config.norm)
+        self.value_net = MLP(config.width(action_dim), config.critic_dense, 1, config.norm)
 
     def qs(self, latent: Tensor, action: Tensor) -> Tensor:
         """Q of every critic: `[*, D], [*, A] → [n, *]` [Q-value, in units of the learner's reward]."""
@@ -73,7 +73,7 @@ class SubgoalHead(Head):
 
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__()
-        latent, norm = config.latent_dim, config.norm
+        latent, norm = config.width(action_dim), config.norm
         self.manager = ConditionalVAE(latent, latent, config.noise_dim, config.generative_dense, norm, bounded=False)
         self.worker = Policy(2 * latent, config.policy_dense, action_dim, norm)
         self.register_buffer("steps_ahead", torch.tensor(0))

@@ -48,7 +48,8 @@ class LatentModel(nn.Module):
     def __init__(self, config: ModelConfig, spaces: Spaces, discount: float, precision: Precision = "float32") -> None:
         super().__init__()
         self.config, self.spaces, self.discount, self.precision = config, spaces, discount, precision
-        latent, action, norm = config.latent_dim, len(spaces.action_low), config.norm
+        action, norm = len(spaces.action_low), config.norm
+        latent = config.width(action)
         self.encoder = Encoder(config, (spaces.height, spaces.width), precision)
         self.dynamics = MLP(latent + action, config.dynamics_dense, latent, norm)
         self.action_model = ConditionalVAE(latent, action, config.noise_dim, config.generative_dense, norm, bounded=True)
@@ -72,9 +73,21 @@ class LatentModel(nn.Module):
         self.bank_latents: Tensor
         self.bank_rows: Tensor
 
-    def encode(self, frames: Tensor) -> Tensor:
-        """φ: uint8 `[*, N, H, W, 3] → [*, D]`."""
-        return self.encoder(frames)
+    def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
+        """φ, and behind it the commands where the config has a memory of them: uint8 `[*, N, H, W, 3] → [*, D]`.
+
+        commands `[*, A]`: leaky mean of the past actions in [-1, 1], `velap.data.commands`; None stands for zeros, as at the
+        start of an episode.
+        """
+        return self.with_commands(self.encoder(frames), commands)
+
+    def with_commands(self, seen: Tensor, commands: Tensor | None = None) -> Tensor:
+        """Output of φ `[*, d_Z]` and commands `[*, A]` → latents `[*, D]`."""
+        if self.config.command_memory == 0:
+            return seen
+        if commands is None:
+            commands = seen.new_zeros(*seen.shape[:-1], self.action_dim)
+        return torch.cat([seen, self.config.command_scale * commands], -1)
 
     def step(self, latent: Tensor, action: Tensor) -> Tensor:
         """h: `[*, D], [*, A] → [*, D]`."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from velap.data.windows import WindowSampler
 from velap.models.horizon import steps_from_q
 from velap.models.latent import LatentModel
-from velap.training.joint import encode_all, evaluated
+from velap.training.joint import encode_all, encode_rows, evaluated
 
 HORIZONS = (1, 3, 10)
 """Rollout lengths that are reported [steps]."""
@@ -46,7 +46,7 @@ def horizons(
     with evaluated(model):
         if cache is None:
             rows = torch.cat([torch.arange(first, last + 1) for first, last in episodes]).to(sampler.device)
-            latents = model.encode(sampler.stacks(rows))
+            latents = encode_rows(model, sampler, rows)
             offsets = torch.cumsum(torch.tensor([0] + [last - first + 1 for first, last in episodes]), 0).tolist()
         else:
             rows = torch.arange(len(cache), device=sampler.device)

@@ -165,26 +165,31 @@ class JointLearner:
         batch = self.sampler.sample(config.batch_windows, config.window, config.whole_windows, self.generator)
         self.model_optimizer.zero_grad(set_to_none=True)
         stacks = self._augmented(self.sampler.stacks(batch.rows), batch)
-        encoded = self.model.encode(stacks)
-        latents = (
-            encoded.detach().requires_grad_()
-        )  # the heads' gradient is gathered here and goes to the encoder in one piece
+        encoded = self.model.encoder(stacks)
+        seen = encoded.detach().requires_grad_()  # the heads' gradient is gathered here and goes to the encoder in one piece
+        latents = self.model.with_commands(seen, self._commands(batch.rows))
         with self._threads(batch):
             predicted, truth, valid = rollouts(self.model, latents, batch, config.dynamics_horizon)
             if config.dynamics_loss == "infonce":
                 candidates = latents[: batch.valid.shape[0] * (batch.valid.shape[1] + 1)]
-                dynamics, info = infonce_loss(predicted, truth, candidates, valid, config.temperature)
+                told = self.model.config.latent_dim  # commands are known: they would tell the candidates apart, not φ
+                dynamics, info = infonce_loss(predicted[..., :told], truth, candidates[:, :told], valid, config.temperature)
             else:
                 dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, torch.ones((), device=latents.device))
             values, more = self.value_loss(latents, batch)
             loss = config.c1 * dynamics + values
             if self.decoder is not None:
-                reconstruction, pixels = self.decoder.loss(latents, stacks, self.generator)
+                reconstruction, pixels = self.decoder.loss(seen, stacks, self.generator)
                 loss, more = loss + config.reconstruction * reconstruction, {**more, "reconstruction/loss": pixels["loss"]}
             loss.backward()
-        encoded.backward(latents.grad)
+        encoded.backward(seen.grad)
         with self._threads(batch):
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch, policies)}
+
+    def _commands(self, rows: Tensor) -> Tensor | None:
+        """[*, A] of rows, None where the model has no memory of them."""
+        memory = self.model.config.command_memory
+        return self.sampler.commands(rows, memory) if memory > 0 else None
 
     def _augmented(self, stacks: Tensor, batch: Batch) -> Tensor:
         """Stacks [M, N, H, W, 3] shifted at random, each group of windows as one: what it shares stays shared."""
@@ -387,9 +392,15 @@ class JointLearner:
         return info
 
 
+def encode_rows(model: LatentModel, sampler: WindowSampler, rows: Tensor) -> Tensor:
+    """Latents of rows of the dataset: int64 [M] -> [M, D]."""
+    memory = model.config.command_memory
+    return model.encode(sampler.stacks(rows), sampler.commands(rows, memory) if memory > 0 else None)
+
+
 @torch.no_grad()
 def encode_all(model: LatentModel, sampler: WindowSampler, chunk: int = 1024) -> Tensor:
     """Latents of every frame of the dataset, float32 [F, D], running statistics."""
     with evaluated(model):
         rows = torch.arange(len(sampler.frames), device=sampler.device)
-        return torch.cat([model.encode(sampler.stacks(part)) for part in rows.split(chunk)])
+        return torch.cat([encode_rows(model, sampler, part) for part in rows.split(chunk)])

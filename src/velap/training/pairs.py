@@ -87,7 +87,7 @@ class PairObjective(nn.Module):
         """`inverse` times the error of the summed actions, plus the reconstruction loss of at most `FRAMES` frames."""
         now, then = self.draw(generator)
         stacks = self.sampler.stacks(torch.cat([now, then]))
-        latents = model.encode(stacks)
+        latents = model.encoder(stacks)
         truth = (self.before[then] - self.before[now]).float()
         error, info = displacement_loss(self.inverse(torch.cat(latents.chunk(2), -1)), truth)
         pixels, seen = self.decoder.loss(latents, stacks, generator)
