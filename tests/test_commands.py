@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_joint import SMALL, config, make_store
 
+from test_joint import SMALL, config, make_store
 from velap.agents.base import METHODS, make_agent
 from velap.agents.states import StateEncoder
 from velap.config import ModelConfig
