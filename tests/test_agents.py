@@ -118,7 +118,8 @@ def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: in
     env = ToyEnv()
     env.reset(seed=0)
     env.set_agent_position(np.array([-0.5, 3.0]))
-    model.encode = lambda frames: torch.from_numpy(env.agent_position())[None]  # no rounding to pixels beside the wall
+    # no rounding to pixels beside the wall
+    model.encode = lambda frames, commands=None: torch.from_numpy(env.agent_position())[None]
     agent.act(frames_at((-0.5, 3.0)))
     with torch.inference_mode():
         set_plan(agent, [(-0.5, 3.0), (3.0, 9.0)])
@@ -173,7 +174,7 @@ def test_residuals_leave_a_wall_that_the_dynamics_walk_through(residuals: int, l
     env, start = ToyEnv(), (-0.1, 2.0)
     env.reset(seed=0)
     env.set_agent_position(np.array(start))
-    model.encode = lambda frames: torch.from_numpy(env.agent_position())[None]
+    model.encode = lambda frames, commands=None: torch.from_numpy(env.agent_position())[None]
     agent.act(frames_at(start))
     with torch.inference_mode():
         set_plan(agent, [start, (5.0, 2.0)])

@@ -87,6 +87,9 @@ class ToyModel(nn.Module):
         self.encoded_batches.append(len(frames))
         return read(frames)
 
+    def to_unit(self, action: Tensor) -> Tensor:
+        return action
+
     def act_local(self, latent: Tensor, goal: Tensor) -> Tensor:
         """The shortest way: straight, or over the tip of the wall."""
         over_the_tip = latent.new_tensor([0.0, TIP + 0.5])
