@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -16,7 +17,7 @@ from velap.data.windows import WindowSampler
 from velap.errors import ConfigError
 from velap.models.heads import HEADS
 from velap.models.latent import LatentModel, Spaces
-from velap.training.joint import encode_all
+from velap.training.latents import encode_all
 from velap.training.loop import Trainer
 
 MEMORY = 0.75
@@ -83,8 +84,6 @@ def test_every_method_sees_its_own_past_actions(method):
         head.method = method
         if hasattr(head, "steps_ahead"):
             head.steps_ahead.fill_(2)
-    import gymnasium as gym
-
     space = gym.spaces.Box(-2.0, 2.0, (3,))
     agent = make_agent(method, model, config(model.config), space, head)
     agent.reset(np.ones(2, bool))

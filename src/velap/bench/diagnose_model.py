@@ -23,7 +23,7 @@ from velap.models.horizon import q_from_steps, steps_from_q
 from velap.models.inference import nearest_row
 from velap.models.latent import LatentModel
 from velap.training.diagnostics import Horizon
-from velap.training.joint import encode_rows
+from velap.training.latents import encode_rows
 from velap.training.loop import holdout_episodes
 
 PAIRS = 1000
@@ -94,8 +94,7 @@ def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, co
 @torch.inference_mode()
 def encode_states(model: LatentModel, sampler: WindowSampler, rows: NDArray[np.int64], chunk: int = 512) -> Tensor:
     """Latents [R, D] of the states at rows [R]."""
-    parts = torch.from_numpy(rows).to(sampler.device).split(chunk)
-    return torch.cat([encode_rows(model, sampler, part) for part in parts]).float()
+    return encode_rows(model, sampler, torch.from_numpy(rows).to(sampler.device), chunk).float()
 
 
 def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:

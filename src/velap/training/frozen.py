@@ -24,7 +24,7 @@ from velap.models.heads import AnyHead
 from velap.models.latent import LatentModel, shared_weights
 from velap.runs import load_tensors, make_generator, save_tensors
 from velap.training.capture import adam, set_rate
-from velap.training.joint import encode_all, evaluated
+from velap.training.latents import encode_all, evaluated
 from velap.training.loop import holdout_episodes
 from velap.training.losses import Info
 from velap.training.steps import cosine

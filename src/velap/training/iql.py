@@ -16,7 +16,7 @@ from torch import Tensor
 
 from velap.models.heads import IQLHead
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
-from velap.training.joint import evaluated
+from velap.training.latents import evaluated
 from velap.training.losses import Info, cloning_error, polyak, td_target
 from velap.training.steps import cosine
 

@@ -9,8 +9,8 @@ model g learns beside the policies, on fixed latents too: Eq. 2 has no term for 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 
 import torch
@@ -22,6 +22,7 @@ from velap.threads import one_thread
 from velap.train_config import TrainConfig
 from velap.training.capture import Captured, adam, set_rate
 from velap.training.clones import Clones, fresh
+from velap.training.latents import commands_before, encode_all, evaluated
 from velap.training.losses import (
     Info,
     action_model_loss,
@@ -42,19 +43,6 @@ from velap.training.transitions import TransitionObjective
 
 TRANSITIONS_A_THREAD = 512
 """Transitions of a batch up to which the heads work on one thread of a CPU. ours."""
-
-
-@contextmanager
-def evaluated(*modules: nn.Module) -> Iterator[None]:
-    """Modules that are only evaluated use running statistics (BatchNorm): targets, and critics under the policy loss."""
-    trained = [module for module in modules if module.training]
-    for module in trained:
-        module.eval()
-    try:
-        yield
-    finally:
-        for module in trained:
-            module.train()
 
 
 def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -167,7 +155,7 @@ class JointLearner:
         stacks = self._augmented(self.sampler.stacks(batch.rows), batch)
         encoded = self.model.encoder(stacks)
         seen = encoded.detach().requires_grad_()  # the heads' gradient is gathered here and goes to the encoder in one piece
-        latents = self.model.with_commands(seen, self._commands(batch.rows))
+        latents = self.model.with_commands(seen, commands_before(self.model, self.sampler, batch.rows))
         with self._threads(batch):
             predicted, truth, valid = rollouts(self.model, latents, batch, config.dynamics_horizon)
             if config.dynamics_loss == "infonce":
@@ -185,11 +173,6 @@ class JointLearner:
         encoded.backward(seen.grad)
         with self._threads(batch):
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch, policies)}
-
-    def _commands(self, rows: Tensor) -> Tensor | None:
-        """[*, A] of rows, None where the model has no memory of them."""
-        memory = self.model.config.command_memory
-        return self.sampler.commands(rows, memory) if memory > 0 else None
 
     def _augmented(self, stacks: Tensor, batch: Batch) -> Tensor:
         """Stacks [M, N, H, W, 3] shifted at random, each group of windows as one: what it shares stays shared."""
@@ -390,17 +373,3 @@ class JointLearner:
         loss.backward(inputs=self.policy_parameters)
         self.policy_optimizer.step()
         return info
-
-
-def encode_rows(model: LatentModel, sampler: WindowSampler, rows: Tensor) -> Tensor:
-    """Latents of rows of the dataset: int64 [M] -> [M, D]."""
-    memory = model.config.command_memory
-    return model.encode(sampler.stacks(rows), sampler.commands(rows, memory) if memory > 0 else None)
-
-
-@torch.no_grad()
-def encode_all(model: LatentModel, sampler: WindowSampler, chunk: int = 1024) -> Tensor:
-    """Latents of every frame of the dataset, float32 [F, D], running statistics."""
-    with evaluated(model):
-        rows = torch.arange(len(sampler.frames), device=sampler.device)
-        return torch.cat([encode_rows(model, sampler, part) for part in rows.split(chunk)])
