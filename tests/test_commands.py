@@ -115,3 +115,42 @@ def test_latents_without_memory_are_what_the_encoder_says():
 def test_a_memory_without_sense_is_refused(changes):
     with pytest.raises(ConfigError, match=next(iter(changes))):
         ModelConfig(**changes)
+
+
+def test_heads_afresh_learn_with_commands_and_the_encoder_without(tmp_path: Path):
+    settings = config(REMEMBERING, heads_afresh=True, joint_steps=2, latent_steps=2)
+    run = Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
+    model, sampler = run.model, run.sampler
+    for _ in range(2):
+        run.update()
+    assert not encode_all(model, sampler)[:, -3:].any()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    run.update()
+    latents = encode_all(model, sampler)
+    torch.testing.assert_close(latents[:, -3:], 3.0 * sampler.commands(torch.arange(len(latents)), MEMORY))
+    for name, value in model.named_parameters():
+        if name.startswith("encoder."):
+            assert torch.equal(value, before[name]), name
+        elif name.endswith("0.weight"):  # new weights are as far from the old ones as they are large
+            assert (value - before[name]).norm() > 0.5 * before[name].norm(), name
+    learnt = run.learner.local_target.weights[0] - model.local_critics.weights[0]
+    assert learnt.norm() < 0.5 * model.local_critics.weights[0].norm()
+
+
+@pytest.mark.parametrize("stop", [1, 2, 3])
+def test_a_training_with_heads_afresh_resumes_to_the_same_bits(tmp_path: Path, stop: int):
+    settings = config(REMEMBERING, heads_afresh=True, joint_steps=2, latent_steps=3)
+    whole = Trainer(settings, make_store(), tmp_path / "whole", 0, torch.device("cpu"))
+    for _ in range(5):
+        whole.update()
+    first = Trainer(settings, make_store(), tmp_path / "parts", 0, torch.device("cpu"))
+    for _ in range(stop):
+        first.update()
+    (tmp_path / "parts").mkdir()
+    first.save()
+    second = Trainer(settings, make_store(), tmp_path / "parts", 0, torch.device("cpu"))
+    second.resume()
+    for _ in range(5 - stop):
+        second.update()
+    for name, value in whole.model.state_dict().items():
+        assert torch.equal(value, second.model.state_dict()[name]), name

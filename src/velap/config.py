@@ -306,6 +306,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "encoder_rewarded_share",
         "encoder_learning_rate",
         "inverse",
+        "heads_afresh",
         "latent_rewarded_share",
         "latent_dynamics_steps",
         "latent_dynamics_batch",

@@ -61,12 +61,16 @@ class LatentModel(nn.Module):
         if config.critic_bounded:
             for critic in (self.local_critics, self.global_critic):
                 nn.init.constant_(critic.biases[-1], UNREWARDED)
+        if config.command_memory > 0:
+            self.register_buffer("command_weight", torch.tensor(config.command_scale))
         self.register_buffer("action_low", torch.tensor(spaces.action_low))
         self.register_buffer("action_high", torch.tensor(spaces.action_high))
         self.register_buffer("step_distance", torch.tensor(0.0))
         # Half precision is a thousandth of a one-step distance and keeps a released checkpoint below 3 MB.
         self.register_buffer("bank_latents", torch.zeros(config.bank_size, latent, dtype=torch.float16))
         self.register_buffer("bank_rows", torch.full((config.bank_size,), -1, dtype=torch.int32))
+        self.command_weight: Tensor
+        """float32 [], what the commands are multiplied by: `command_scale`, or 0 while a training is to do without them."""
         self.action_low: Tensor
         self.action_high: Tensor
         self.step_distance: Tensor
@@ -87,7 +91,7 @@ class LatentModel(nn.Module):
             return seen
         if commands is None:
             commands = seen.new_zeros(*seen.shape[:-1], self.action_dim)
-        return torch.cat([seen, self.config.command_scale * commands], -1)
+        return torch.cat([seen, self.command_weight * commands], -1)
 
     def step(self, latent: Tensor, action: Tensor) -> Tensor:
         """h: `[*, D], [*, A] → [*, D]`."""
@@ -139,6 +143,15 @@ class LatentModel(nn.Module):
     def bound(self, raw: Tensor) -> Tensor:
         """Critic output as a Q-value: a sigmoid when the config bounds it to [0, 1]."""
         return torch.sigmoid(raw) if self.config.critic_bounded else raw
+
+    @torch.no_grad()
+    def start_heads_afresh(self, seed: int) -> None:
+        """New weights for everything but φ, commands included from here on; weights stay in their memory."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            new = LatentModel(self.config, self.spaces, self.discount, self.precision)
+        new.encoder.load_state_dict(self.encoder.state_dict())
+        self.load_state_dict(new.state_dict())
 
     @property
     def action_dim(self) -> int:

@@ -67,6 +67,8 @@ class JointLearner:
 
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
+        if config.heads_afresh and model.config.command_memory > 0:
+            model.command_weight.zero_()
         self.local_target = copy.deepcopy(model.local_critics).requires_grad_(False).eval()
         self.global_target = copy.deepcopy(model.global_critic).requires_grad_(False).eval()
         self.decoder = None
@@ -295,6 +297,13 @@ class JointLearner:
     def _threads(self, batch: Batch) -> AbstractContextManager[None]:
         """One thread for the heads while a batch is small."""
         return one_thread(batch.start.device, len(batch.start) <= TRANSITIONS_A_THREAD)
+
+    def start_heads_afresh(self) -> None:
+        """New weights for all but the encoder, targets included, before the latent phase (`heads_afresh`)."""
+        drawn = torch.randint(2**31, (1,), generator=self.generator, device=self.generator.device)
+        self.model.start_heads_afresh(int(drawn))
+        self.local_target.load_state_dict(self.model.local_critics.state_dict())
+        self.global_target.load_state_dict(self.model.global_critic.state_dict())
 
     def begin_latent_phase(self) -> None:
         """Freeze the encoder, cache every latent of the dataset [F, D], start fresh optimisers."""

@@ -133,8 +133,11 @@ class Trainer:
 
     def _freeze(self) -> None:
         """The phases after the joint one work on cached latents."""
-        if self.learner.cache is None:
-            self.learner.begin_latent_phase()
+        if self.learner.cache is not None:
+            return
+        if self.config.train.heads_afresh:
+            self.learner.start_heads_afresh()
+        self.learner.begin_latent_phase()
 
     def report(self) -> dict[str, float]:
         """Diagnostics on held-out episodes."""
