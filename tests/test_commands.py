@@ -111,7 +111,9 @@ def test_latents_without_memory_are_what_the_encoder_says():
     torch.testing.assert_close(model.encode(frames, torch.ones(2, 3)), model.encoder(frames))
 
 
-@pytest.mark.parametrize("changes", [{"command_memory": 1.0}, {"command_memory": -0.1}, {"command_scale": 0.0}])
+@pytest.mark.parametrize(
+    "changes", [{"command_memory": 1.0}, {"command_memory": -0.1}, {"command_scale": 0.0}, {"command_dims": -1}]
+)
 def test_a_memory_without_sense_is_refused(changes):
     with pytest.raises(ConfigError, match=next(iter(changes))):
         ModelConfig(**changes)
@@ -154,3 +156,17 @@ def test_a_training_with_heads_afresh_resumes_to_the_same_bits(tmp_path: Path, s
         second.update()
     for name, value in whole.model.state_dict().items():
         assert torch.equal(value, second.model.state_dict()[name]), name
+
+
+def test_the_first_actions_alone_are_remembered():
+    model = make_model(dataclasses.replace(REMEMBERING, command_dims=2))
+    sampler = WindowSampler(make_store(), config().train, 2, torch.device("cpu"), np.zeros(0, np.int64))
+    latents = encode_all(model, sampler)
+    assert latents.shape[1] == REMEMBERING.latent_dim + 2 == model.config.width(3)
+    expected = 3.0 * sampler.commands(torch.arange(len(latents)), MEMORY)[:, :2]
+    torch.testing.assert_close(latents[:, -2:], expected)
+    states = StateEncoder(model)
+    states.forget(np.ones(1, bool))
+    states.act(torch.tensor([[1.0, -1.0, 0.5]]))
+    seen = states(np.zeros((1, 2, 16, 16, 3), np.uint8))[0, REMEMBERING.latent_dim :]
+    torch.testing.assert_close(seen, 3.0 * (1 - MEMORY) * torch.tensor([1.0, -1.0]))

@@ -30,6 +30,9 @@ class ModelConfig:
     norm: Norm = "layer"
     """Normalisation of hidden layers. Tables 2-6: batch. ours: layer, no train/eval gap and no batch statistics in
     targets."""
+    moment_colours: int = 0
+    """Colours of the palette whose moments the encoder takes instead of convolutions; 0 takes convolutions. ours: centres of
+    colours tell places to a tenth of a pixel after a minute of training (`docs/decisions.md`)."""
     encoder_filters: tuple[int, ...] = (32, 32, 64, 64)
     """Table 2."""
     encoder_kernels: tuple[int, ...] = (4, 4, 4, 4)
@@ -65,11 +68,14 @@ class ModelConfig:
     speed of what follows commands slowly is hard to see in pixels. ours; 0 (off) in `paper`."""
     command_scale: float = 2.0
     """What that mean is multiplied by [latent distance]. ours."""
+    command_dims: int = 0
+    """So many actions are remembered, the first ones; 0 remembers all. ours: a gripper that no task needs is noise."""
     bank_size: int = 4096
     """Dataset latents kept with the model for support tests and film strips; 0 keeps none. ours; 0 in `paper`."""
 
     def __post_init__(self) -> None:
         require(1 <= self.frame_stack <= 16, "frame_stack", self.frame_stack, "1 to 16 frames")
+        require(0 <= self.moment_colours <= 256, "moment_colours", self.moment_colours, "0 to 256 colours")
         require(self.latent_dim >= 1, "latent_dim", self.latent_dim, "a positive number of units")
         require(self.norm in get_args(Norm), "norm", self.norm, f"one of {get_args(Norm)}")
         sizes = {len(self.encoder_filters), len(self.encoder_kernels), len(self.encoder_strides)}
@@ -79,11 +85,14 @@ class ModelConfig:
         require(self.n_global >= 1, "n_global", self.n_global, "at least one critic")
         require(0 <= self.command_memory < 1, "command_memory", self.command_memory, "at least 0 and less than 1")
         require(self.command_scale > 0, "command_scale", self.command_scale, "a positive number")
+        require(self.command_dims >= 0, "command_dims", self.command_dims, "0 or a number of actions")
         require(self.bank_size >= 0, "bank_size", self.bank_size, "0 or a number of latents")
 
     def width(self, action_dim: int) -> int:
         """D, dimensions of a latent with all that is in it."""
-        return self.latent_dim + (action_dim if self.command_memory > 0 else 0)
+        if self.command_memory == 0:
+            return self.latent_dim
+        return self.latent_dim + min(self.command_dims or action_dim, action_dim)
 
 
 @dataclass(frozen=True)
@@ -298,7 +307,8 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "model": ("success_policy", "command_memory", "command_scale"),
+    "model": ("success_policy", "command_memory", "command_scale", "command_dims",
+              "moment_colours"),
     "train": (
         "encoder_steps",
         "encoder_pairs",

@@ -115,6 +115,23 @@ counts, the latent phase learns the rest, and a policy is cloned from the succes
 goal π^g, which has seen experts there, takes over, and wherever the cloned policy gets to the goal by the model, that one. A
 smaller bank keeps the checkpoint below 3 MB."""
 
+_MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
+    **_SAWYER_DEFAULTS,
+    "model": {**_SAWYER_DEFAULTS["model"], "moment_colours": 24, "command_memory": 0.7, "command_dims": 3},
+    "train": {
+        **_SAWYER_DEFAULTS["train"],
+        "encoder_steps": 8_000,
+        "encoder_pairs": 128,
+        "inverse": 1.0,
+        "joint_steps": 0,
+        "heads_afresh": True,
+        "latent_value_steps": 8_000,
+    },
+    "controller": {**_SAWYER_DEFAULTS["controller"], "stop_exponent": 150.0},
+}
+"""ours: places come from colour moments, the hand's speed from the past actions, and all else is learnt on frozen latents. π^g
+is good on those, and leads wherever Q^g sees the goal within 150 steps; the tree leads from farther away."""
+
 TASKS: dict[str, Task] = {
     task.name: task
     for task in (
@@ -211,10 +228,11 @@ TASKS: dict[str, Task] = {
                 "controller": {"n_replan": 25},
             },
             default_overrides={
-                **_SAWYER_DEFAULTS,
-                "train": {**_SAWYER_DEFAULTS["train"], "latent_value_steps": 8_000},
+                **_MOMENTS_DEFAULTS,
+                "model": {**_MOMENTS_DEFAULTS["model"], "success_policy": False},
+                "train": {**_MOMENTS_DEFAULTS["train"], "clone_steps": 0},
                 "planner": {**_SAWYER_DEFAULTS["planner"], "rehearsals": 4},
-                "controller": {**_SAWYER_DEFAULTS["controller"], "n_replan": 12, "success_rollout": 0},
+                "controller": {**_MOMENTS_DEFAULTS["controller"], "n_replan": 12, "success_rollout": 0},
             },
         ),
         Task(

@@ -108,9 +108,9 @@ class TrainConfig:
     policy_every: int = 2
     """Model updates a policy update. ours (TD3's delay); 1 in `paper`, the alternation of Eq. 2 and 5."""
     heads_afresh: bool = False
-    """The joint phase teaches the encoder alone: it sees no commands (`command_memory`), and h, critics, policies and g start
-    from new weights on the frozen latents. ours: what learnt to do without commands does not take them up later, and an
-    encoder that learns beside them sees less."""
+    """The joint phase teaches the encoder alone: it sees no commands (`command_memory`), and h, critics, policies and g
+    start from new weights on the frozen latents. ours: what learnt to do without commands does not take them up later,
+    and an encoder that learns beside them sees less."""
     latent_steps: int = 4_000
     """Updates of the latent phase: encoder frozen, all latents cached. ours; 0 in `paper`."""
     latent_batch: int = 256

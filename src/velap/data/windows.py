@@ -130,8 +130,12 @@ class WindowSampler:
 
     def stacks(self, rows: Tensor) -> Tensor:
         """Frame stacks of rows: int64 `[*] → uint8 [*, N, H, W, 3]`."""
-        index = stack_indices(rows, self.first[rows], self.frame_stack)
+        index = self.stack_rows(rows)
         return self.frames.index_select(0, index.flatten()).view(*index.shape, *self.frames.shape[1:])
+
+    def stack_rows(self, rows: Tensor) -> Tensor:
+        """Rows of the frames of their stacks, oldest first: int64 `[*] → [*, N]`."""
+        return stack_indices(rows, self.first[rows], self.frame_stack)
 
     def commands(self, rows: Tensor, memory: float) -> Tensor:
         """Leaky means of the actions before rows: int64 `[*] → float32 [*, A]` in [-1, 1]; see `velap.data.commands`."""

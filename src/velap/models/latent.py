@@ -19,6 +19,7 @@ from velap.errors import CheckpointError, VelapError
 from velap.models.folded import dense_layers, fold
 from velap.models.generative import ConditionalVAE
 from velap.models.inference import joined, nearest_row
+from velap.models.moments import MomentEncoder
 from velap.models.native import native_rollout
 from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
 from velap.runs import content_sha256, load_tensors, save_tensors
@@ -50,7 +51,8 @@ class LatentModel(nn.Module):
         self.config, self.spaces, self.discount, self.precision = config, spaces, discount, precision
         action, norm = len(spaces.action_low), config.norm
         latent = config.width(action)
-        self.encoder = Encoder(config, (spaces.height, spaces.width), precision)
+        size = (spaces.height, spaces.width)
+        self.encoder = MomentEncoder(config, size) if config.moment_colours > 0 else Encoder(config, size, precision)
         self.dynamics = MLP(latent + action, config.dynamics_dense, latent, norm)
         self.action_model = ConditionalVAE(latent, action, config.noise_dim, config.generative_dense, norm, bounded=True)
         self.local_policy = Policy(2 * latent, config.policy_dense, action, norm)
@@ -91,7 +93,8 @@ class LatentModel(nn.Module):
             return seen
         if commands is None:
             commands = seen.new_zeros(*seen.shape[:-1], self.action_dim)
-        return torch.cat([seen, self.command_weight * commands], -1)
+        remembered = self.config.command_dims or self.action_dim
+        return torch.cat([seen, self.command_weight * commands[..., :remembered]], -1)
 
     def step(self, latent: Tensor, action: Tensor) -> Tensor:
         """h: `[*, D], [*, A] → [*, D]`."""

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from velap.data.windows import Batch, WindowSampler
 from velap.models.latent import LatentModel
+from velap.models.moments import MomentEncoder
 from velap.threads import one_thread
 from velap.train_config import TrainConfig
 from velap.training.capture import Captured, adam, set_rate
@@ -38,6 +39,7 @@ from velap.training.losses import (
 )
 from velap.training.pairs import FrameDecoder, PairObjective
 from velap.training.shifts import shifted
+from velap.training.slow import MomentObjective
 from velap.training.steps import cosine
 from velap.training.transitions import TransitionObjective
 
@@ -75,7 +77,10 @@ class JointLearner:
         if config.reconstruction > 0:
             self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
         self.transitions: TransitionObjective | None = None
-        self.pairs = PairObjective(model, config, sampler, generator) if config.encoder_steps > 0 else None
+        self.pairs: PairObjective | MomentObjective | None = None
+        if config.encoder_steps > 0:
+            objective = MomentObjective if isinstance(model.encoder, MomentEncoder) else PairObjective
+            self.pairs = objective(model, config, sampler, generator)
         self.clone_optimizer, self.clones = None, None
         if config.clone_steps > 0:
             assert model.success_policy is not None, "clone_steps asks for success_policy"
@@ -136,6 +141,8 @@ class JointLearner:
 
     def encoder_step(self) -> Info:
         """One update of the encoder alone, on pairs of states (ours)."""
+        if isinstance(self.pairs, MomentObjective):
+            self.pairs.prepare(self.model)
         return self._run("encoder", self._update_encoder)
 
     def _update_encoder(self) -> Info:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from velap.data.windows import WindowSampler
 from velap.models.latent import LatentModel
+from velap.models.moments import MomentEncoder
 
 
 @contextmanager
@@ -38,7 +39,18 @@ def encode_rows(model: LatentModel, sampler: WindowSampler, rows: Tensor, chunk:
 
 
 @torch.no_grad()
+def all_moments(encoder: MomentEncoder, sampler: WindowSampler) -> Tensor:
+    """Standardised colour moments of every frame of the dataset, float32 [F, C]; a stack would measure its frames again."""
+    return torch.cat([encoder.moments(frames) for frames in sampler.frames.split(500)])
+
+
+@torch.no_grad()
 def encode_all(model: LatentModel, sampler: WindowSampler) -> Tensor:
     """Latents of every frame of the dataset, float32 [F, D], running statistics."""
+    rows = torch.arange(len(sampler.frames), device=sampler.device)
     with evaluated(model):
-        return encode_rows(model, sampler, torch.arange(len(sampler.frames), device=sampler.device))
+        if not isinstance(model.encoder, MomentEncoder):
+            return encode_rows(model, sampler, rows)
+        moments = all_moments(model.encoder, sampler)
+        seen = [model.encoder.from_moments(moments[sampler.stack_rows(part)]) for part in rows.split(4096)]
+        return model.with_commands(torch.cat(seen), commands_before(model, sampler, rows))

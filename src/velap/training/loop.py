@@ -22,9 +22,11 @@ from velap.data.episodes import FrameStore
 from velap.data.windows import WindowSampler
 from velap.errors import CheckpointError, ConfigError, DatasetError
 from velap.models.latent import LatentModel, Spaces, save_checkpoint
+from velap.models.moments import MomentEncoder
 from velap.runs import MetricsLog, make_generator, write_atomic
 from velap.training.diagnostics import diagnose, measure_latents
 from velap.training.joint import JointLearner
+from velap.training.slow import fit_palette
 from velap.training.state import SCHEDULE, load_state, save_state
 from velap.training.steps import Cadence, Progress, cosine, interrupt_flag, run_steps
 
@@ -65,6 +67,8 @@ class Trainer:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.model = LatentModel(config.model, spaces, train.discount, train.precision).to(device).train()
+        if isinstance(self.model.encoder, MomentEncoder):
+            fit_palette(self.model.encoder, self.sampler, seed)
         self.generator = make_generator(seed, stream=1, device=device)
         self.learner = JointLearner(self.model, train, self.sampler, self.generator)
         self.step, self.seconds = 0, 0.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from velap.data.commands import remembered
 from velap.data.windows import WindowSampler
 from velap.models.latent import LatentModel
 from velap.models.networks import MLP
@@ -48,11 +49,11 @@ class FrameDecoder(MLP):
         return reconstruction_loss(self(latents[chosen]), self.shrink(stacks[chosen]), self.mean, self.deviation)
 
 
-class PairObjective(nn.Module):
-    """Multi-step inverse dynamics and reconstruction of single frames, on pairs of states of one trajectory.
+class Pairs(nn.Module):
+    """Pairs of states of one trajectory, from all over the data, and a multi-step inverse model on them.
 
-    Windows of neighbouring scenes, which the joint phase needs, are few different pictures; pairs come from all over the
-    data. What it learns beside the encoder is thrown away.
+    Windows of neighbouring scenes, which the joint phase needs, are few different pictures. What is learnt beside the
+    encoder is thrown away.
     """
 
     HIDDEN = (256, 256)
@@ -61,14 +62,16 @@ class PairObjective(nn.Module):
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         super().__init__()
         self.config, self.sampler = config, sampler
-        self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
         actions = sampler.actions.shape[1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(generator.initial_seed())
             self.inverse = MLP(2 * model.config.latent_dim, self.HIDDEN, actions, "layer").to(sampler.device)
-        summed = sampler.actions.double().cumsum(0)
-        self.before = summed - sampler.actions
-        """float64 [F, A], sum of all actions before each row."""
+        moved, memory = sampler.actions, model.config.command_memory
+        if memory > 0:
+            moved = remembered(sampler.commands(torch.arange(len(moved), device=sampler.device), memory), moved, memory)
+        self.before = moved.double().cumsum(0) - moved
+        """float64 [F, A], sum of all actions before each row, or of their leaky mean where the model has a memory of them:
+        what lags behind its commands has gone as far as that mean says."""
 
     def draw(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Rows int64 [P] of a state and of one at most `encoder_reach` steps later in the same episode."""
@@ -83,13 +86,27 @@ class PairObjective(nn.Module):
         ahead = torch.randint(1, reach + 1, shape, generator=generator, device=device)
         return now, torch.minimum(now + ahead, sampler.last[now])
 
+    def displacement(self, latents: Tensor, now: Tensor, then: Tensor) -> tuple[Tensor, Tensor]:
+        """Loss of the inverse model between rows `now` and `then` [P], whose latents stand one after the other [2 P, D], and
+        its error."""
+        truth = (self.before[then] - self.before[now]).float()
+        loss, info = displacement_loss(self.inverse(torch.cat(latents.chunk(2), -1)), truth)
+        return loss, info["error"]
+
+
+class PairObjective(Pairs):
+    """Multi-step inverse dynamics and reconstruction of single frames."""
+
+    def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
+        super().__init__(model, config, sampler, generator)
+        self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
+
     def loss(self, model: LatentModel, generator: torch.Generator) -> tuple[Tensor, Info]:
         """`inverse` times the error of the summed actions, plus the reconstruction loss of at most `FRAMES` frames."""
         now, then = self.draw(generator)
         stacks = self.sampler.stacks(torch.cat([now, then]))
         latents = model.encoder(stacks)
-        truth = (self.before[then] - self.before[now]).float()
-        error, info = displacement_loss(self.inverse(torch.cat(latents.chunk(2), -1)), truth)
+        displacement, error = self.displacement(latents, now, then)
         pixels, seen = self.decoder.loss(latents, stacks, generator)
-        losses = {"encoder/displacement": info["error"], "encoder/reconstruction": seen["loss"]}
-        return self.config.inverse * error + pixels, losses
+        losses = {"encoder/displacement": error, "encoder/reconstruction": seen["loss"]}
+        return self.config.inverse * displacement + pixels, losses
