@@ -1,4 +1,4 @@
-"""Colour moments: what they say of pictures with known contents, the slow features of them, and an encoder that takes them."""
+"""Colour moments: what they say of pictures with known contents, slow features of them, and an encoder that takes them."""
 
 import dataclasses
 from pathlib import Path

@@ -129,8 +129,8 @@ _MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "controller": {**_SAWYER_DEFAULTS["controller"], "stop_exponent": 150.0},
 }
-"""ours: places come from colour moments, the hand's speed from the past actions, and all else is learnt on frozen latents. π^g
-is good on those, and leads wherever Q^g sees the goal within 150 steps; the tree leads from farther away."""
+"""ours: places come from colour moments, the hand's speed from the past actions, and all else is learnt on frozen latents.
+π^g is good on those, and leads wherever Q^g sees the goal within 150 steps; the tree leads from farther away."""
 
 TASKS: dict[str, Task] = {
     task.name: task
