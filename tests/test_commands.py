@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from test_joint import SMALL, config, make_store
+from test_joint import SMALL, config, make_store, straight_and_resumed
 from velap.agents.base import METHODS, make_agent
 from velap.agents.states import StateEncoder
 from velap.config import ModelConfig
@@ -19,6 +19,7 @@ from velap.models.heads import HEADS
 from velap.models.latent import LatentModel, Spaces
 from velap.training.latents import encode_all
 from velap.training.loop import Trainer
+from velap.training.pairs import Pairs
 
 MEMORY = 0.75
 REMEMBERING = dataclasses.replace(SMALL, command_memory=MEMORY, command_scale=3.0)
@@ -142,20 +143,7 @@ def test_heads_afresh_learn_with_commands_and_the_encoder_without(tmp_path: Path
 @pytest.mark.parametrize("stop", [1, 2, 3])
 def test_a_training_with_heads_afresh_resumes_to_the_same_bits(tmp_path: Path, stop: int):
     settings = config(REMEMBERING, heads_afresh=True, joint_steps=2, latent_steps=3)
-    whole = Trainer(settings, make_store(), tmp_path / "whole", 0, torch.device("cpu"))
-    for _ in range(5):
-        whole.update()
-    first = Trainer(settings, make_store(), tmp_path / "parts", 0, torch.device("cpu"))
-    for _ in range(stop):
-        first.update()
-    (tmp_path / "parts").mkdir()
-    first.save()
-    second = Trainer(settings, make_store(), tmp_path / "parts", 0, torch.device("cpu"))
-    second.resume()
-    for _ in range(5 - stop):
-        second.update()
-    for name, value in whole.model.state_dict().items():
-        assert torch.equal(value, second.model.state_dict()[name]), name
+    straight_and_resumed(tmp_path, settings, stop)
 
 
 def test_the_first_actions_alone_are_remembered():
@@ -170,3 +158,15 @@ def test_the_first_actions_alone_are_remembered():
     states.act(torch.tensor([[1.0, -1.0, 0.5]]))
     seen = states(np.zeros((1, 2, 16, 16, 3), np.uint8))[0, REMEMBERING.latent_dim :]
     torch.testing.assert_close(seen, 3.0 * (1 - MEMORY) * torch.tensor([1.0, -1.0]))
+
+
+def test_the_inverse_model_tells_how_far_a_lagging_hand_went():
+    sampler = WindowSampler(make_store(), config().train, 2, torch.device("cpu"), np.zeros(0, np.int64))
+    told = Pairs(make_model(), config().train, sampler, torch.Generator()).before
+    row, mean, way = 3, torch.zeros(3), torch.zeros(3)
+    for action in sampler.actions[:row]:
+        mean = MEMORY * mean + (1 - MEMORY) * action
+        way = way + mean
+    torch.testing.assert_close(told[row], way.double())
+    plain = Pairs(make_model(SMALL), config().train, sampler, torch.Generator()).before
+    torch.testing.assert_close(plain[row], sampler.actions[:row].double().sum(0))

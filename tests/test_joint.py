@@ -82,6 +82,25 @@ def trainer(tmp_path: Path, norm: str = "layer", **changes) -> Trainer:
     return Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
 
 
+def straight_and_resumed(path: Path, settings: Config, stop: int) -> tuple[Trainer, Trainer]:
+    """A run to its end, and one that is saved after `stop` updates and resumed; their weights have the same bits."""
+    straight, broken, again = (
+        Trainer(settings, make_store(), path / name, 0, torch.device("cpu")) for name in ("straight", "broken", "broken")
+    )
+    for _ in range(straight.total):
+        straight.update()
+    for _ in range(stop):
+        broken.update()
+    broken.run_dir.mkdir(parents=True, exist_ok=True)
+    broken.save()
+    again.resume()
+    while again.step < again.total:
+        again.update()
+    expected = straight.model.state_dict()
+    assert [name for name, value in again.model.state_dict().items() if not torch.equal(value, expected[name])] == []
+    return straight, again
+
+
 def touched(module: torch.nn.Module) -> bool:
     return any(p.grad is not None and p.grad.abs().sum() > 0 for p in module.parameters())
 
@@ -351,21 +370,8 @@ def test_the_clone_phase_moves_the_policy_of_successes_alone_towards_their_actio
 
 
 def test_a_resume_in_the_clone_phase_goes_on_to_the_same_bits(tmp_path):
-    def make(name):
-        return Trainer(config(CLONED, clone_steps=4), make_store(), tmp_path / name, 0, torch.device("cpu"))
-
-    straight, broken = make("a"), make("b")
-    for _ in range(straight.total):
-        straight.update()
-    for _ in range(straight.total - 2):
-        broken.update()
-    broken.save()
-    again = make("b")
-    again.resume()
-    for _ in range(2):
-        again.update()
-    expected = straight.model.state_dict()
-    assert all(torch.equal(v, expected[k]) for k, v in again.model.state_dict().items())
+    settings = config(CLONED, clone_steps=4)
+    _, again = straight_and_resumed(tmp_path, settings, settings.train.steps - 2)
     loaded, _, _ = load_checkpoint(again.finish("x").checkpoint)
     assert loaded.search_fns()["act_success"](torch.zeros(2, SMALL.latent_dim)).shape == (2, 3)
 
@@ -399,19 +405,8 @@ def test_an_annealed_run_cannot_be_resumed_with_another_length(tmp_path):
 @pytest.mark.parametrize("norm", ["layer", "batch"])
 @pytest.mark.parametrize(("encoder", "stop"), [(0, 2), (0, 6), (0, 10), (3, 2), (3, 4)])
 def test_resume_goes_on_to_the_same_bits(tmp_path, norm, encoder, stop):
-    straight = trainer(tmp_path / "a", norm, reconstruction=0.5, encoder_steps=encoder)
-    broken = trainer(tmp_path / "b", norm, reconstruction=0.5, encoder_steps=encoder)
-    for _ in range(12):
-        straight.update()
-    for _ in range(stop):
-        broken.update()
-    broken.save()
-    again = trainer(tmp_path / "b", norm, reconstruction=0.5, encoder_steps=encoder)
-    again.resume()
-    for _ in range(12 - stop):
-        again.update()
-    expected = straight.model.state_dict()
-    assert all(torch.equal(v, expected[k]) for k, v in again.model.state_dict().items())
+    settings = config(dataclasses.replace(SMALL, norm=norm), reconstruction=0.5, encoder_steps=encoder)
+    straight, _ = straight_and_resumed(tmp_path, settings, stop)
     assert straight.finish("x").sha256  # the measured latents and the bank complete the model
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from test_joint import SMALL, config, make_store
+from test_joint import SMALL, config, make_store, straight_and_resumed
 from velap.config import ModelConfig
 from velap.data.windows import WindowSampler
 from velap.errors import ConfigError
@@ -133,20 +133,7 @@ def test_the_encoder_learns_moments_and_slow_features(tmp_path: Path):
 @pytest.mark.parametrize("stop", [1, 3, 5])
 def test_a_training_with_moments_resumes_to_the_same_bits_and_is_read_again(tmp_path: Path, stop: int):
     settings = config(SEEING, encoder_steps=2, joint_steps=2, latent_steps=2)
-    whole = Trainer(settings, make_store(), tmp_path / "whole", 0, torch.device("cpu"))
-    for _ in range(6):
-        whole.update()
-    first = Trainer(settings, make_store(), tmp_path / "parts", 0, torch.device("cpu"))
-    for _ in range(stop):
-        first.update()
-    (tmp_path / "parts").mkdir()
-    first.save()
-    second = Trainer(settings, make_store(), tmp_path / "parts", 0, torch.device("cpu"))
-    second.resume()
-    for _ in range(6 - stop):
-        second.update()
-    for name, value in whole.model.state_dict().items():
-        assert torch.equal(value, second.model.state_dict()[name]), name
+    _, second = straight_and_resumed(tmp_path, settings, stop)
     read, _, _ = load_checkpoint(second.finish("test").checkpoint)
     assert isinstance(read.encoder, MomentEncoder)
     assert torch.equal(read.encoder.moments.palette, second.model.encoder.moments.palette)

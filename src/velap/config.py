@@ -307,8 +307,7 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "model": ("success_policy", "command_memory", "command_scale", "command_dims",
-              "moment_colours"),
+    "model": ("success_policy", "command_memory", "command_scale", "command_dims", "moment_colours"),
     "train": (
         "encoder_steps",
         "encoder_pairs",

@@ -38,8 +38,8 @@ RESIDUAL = 0.5
 def fit_palette(encoder: MomentEncoder, sampler: WindowSampler, seed: int) -> None:
     """Palette and scale of the moments from frames all over the data."""
     rows = np.linspace(0, len(sampler.frames) - 1, min(PALETTE_FRAMES, len(sampler.frames))).astype(np.int64)
-    stacks = sampler.stacks(torch.from_numpy(rows).to(sampler.device))
-    encoder.moments.fit(stacks[:, -1].cpu().numpy(), seed)
+    frames = sampler.frames[torch.from_numpy(rows).to(sampler.device)]
+    encoder.moments.fit(frames.cpu().numpy(), seed)
 
 
 def slow_features(moments: Tensor, last: Tensor, count: int = SLOW) -> Tensor:
