@@ -33,6 +33,9 @@ class ModelConfig:
     moment_colours: int = 0
     """Colours of the palette whose moments the encoder takes instead of convolutions; 0 takes convolutions. ours: centres of
     colours tell places to a tenth of a pixel after a minute of training (`docs/decisions.md`)."""
+    slow_features: int = 0
+    """The last so many of φ's units are the slowest linear features of the moments, as they are. ours: dense layers lose a
+    third of what moments tell of where a window is (`docs/decisions.md`)."""
     encoder_filters: tuple[int, ...] = (32, 32, 64, 64)
     """Table 2."""
     encoder_kernels: tuple[int, ...] = (4, 4, 4, 4)
@@ -77,6 +80,9 @@ class ModelConfig:
         require(1 <= self.frame_stack <= 16, "frame_stack", self.frame_stack, "1 to 16 frames")
         require(0 <= self.moment_colours <= 256, "moment_colours", self.moment_colours, "0 to 256 colours")
         require(self.latent_dim >= 1, "latent_dim", self.latent_dim, "a positive number of units")
+        most = min(self.latent_dim - 1, 6 * self.moment_colours)
+        require(0 <= self.slow_features <= max(most, 0), "slow_features", self.slow_features,
+                f"0 to {max(most, 0)}: less than latent_dim, and no more than there are moments (6 × moment_colours)")
         require(self.norm in get_args(Norm), "norm", self.norm, f"one of {get_args(Norm)}")
         sizes = {len(self.encoder_filters), len(self.encoder_kernels), len(self.encoder_strides)}
         require(len(sizes) == 1, "encoder_filters", self.encoder_filters, "as many filters as kernels and strides")
@@ -230,6 +236,12 @@ class Config:
             self.train.critic_loss,
             "'mse' where `critic_bounded` is off: cross entropy asks for Q-values in [0, 1]",
         )
+        require(
+            self.model.slow_features == 0 or self.train.encoder_steps > 0,
+            "encoder_steps",
+            self.train.encoder_steps,
+            "at least 1 where `slow_features` is set: the encoder phase finds them",
+        )
         for name, steps in (("clone_steps", self.train.clone_steps), ("success_rollout", self.controller.success_rollout)):
             require(self.model.success_policy or steps == 0, name, steps, "0 where `success_policy` is off")
 
@@ -307,7 +319,8 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "model": ("success_policy", "command_memory", "command_scale", "command_dims", "moment_colours"),
+    "model": ("success_policy", "command_memory", "command_scale", "command_dims", "moment_colours",
+              "slow_features"),
     "train": (
         "encoder_steps",
         "encoder_pairs",
@@ -324,6 +337,9 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "latent_ridge",
         "latent_value_steps",
         "latent_value_batch",
+        "member_steps",
+        "members",
+        "distil_steps",
         "clone_steps",
         "clone_candidates",
         "critic_loss",

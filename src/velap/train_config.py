@@ -136,6 +136,13 @@ class TrainConfig:
     hundred steps from the goal take thousands of updates, and h's rollouts would cost most of them."""
     latent_value_batch: int = 512
     """Transitions a batch of those. ours."""
+    member_steps: int = 0
+    """Updates of `members` π^g with critics of their own after the values, on cached latents; 0 has none [steps]. ours:
+    where the data are thin, what one policy does is luck; the mean of several is less so."""
+    members: int = 4
+    """Those policies. ours."""
+    distil_steps: int = 0
+    """Updates that teach the members' mean action and value to the model's π^g and Q^g [steps]. ours."""
     latent_heads: bool = True
     """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
     clone_steps: int = 0
@@ -159,7 +166,8 @@ class TrainConfig:
     """Model updates between checkpoints [steps]. ours."""
 
     def __post_init__(self) -> None:
-        later = ("latent_steps", "latent_dynamics_steps", "latent_value_steps", "clone_steps")
+        later = ("latent_steps", "latent_dynamics_steps", "latent_value_steps", "member_steps", "distil_steps",
+                 "clone_steps")
         for name in ("encoder_steps", "joint_steps", *later, "value_transitions", "dynamics_rollouts"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in (
@@ -176,6 +184,7 @@ class TrainConfig:
             "latent_dynamics_batch",
             "latent_dynamics_horizon",
             "latent_value_batch",
+            "members",
             "clone_candidates",
             "log_every",
             "diagnose_every",
@@ -188,6 +197,8 @@ class TrainConfig:
             require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
         require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
+        require((self.distil_steps > 0) == (self.member_steps > 0), "distil_steps", self.distil_steps,
+                "at least 1 where `member_steps` is set, and 0 where it is not")
         require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
         require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
         for name in ("rewarded_share", "latent_rewarded_share", "encoder_rewarded_share"):
@@ -232,5 +243,7 @@ class TrainConfig:
             ("latent", self.latent_steps),
             ("dynamics", self.latent_dynamics_steps),
             ("values", self.latent_value_steps),
+            ("members", self.member_steps),
+            ("distil", self.distil_steps),
             ("clone", self.clone_steps),
         )

@@ -37,6 +37,7 @@ from velap.training.losses import (
     rollout_mse_loss,
     td_target,
 )
+from velap.training.members import Members
 from velap.training.pairs import FrameDecoder, PairObjective
 from velap.training.shifts import shifted
 from velap.training.slow import MomentObjective
@@ -65,7 +66,7 @@ def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple
 
 class JointLearner:
     """Owns the model, its target critics and the optimisers; `encoder_step`, `joint_step`, `latent_step`,
-    `dynamics_step`, `value_step` and `clone_step` are single updates."""
+    `dynamics_step`, `value_step`, `member_step`, `distil_step` and `clone_step` are single updates."""
 
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
@@ -81,6 +82,16 @@ class JointLearner:
         if config.encoder_steps > 0:
             objective = MomentObjective if isinstance(model.encoder, MomentEncoder) else PairObjective
             self.pairs = objective(model, config, sampler, generator)
+        self.members: Members | None = None
+        self.member_optimizers: dict[str, torch.optim.Optimizer] = {}
+        if config.member_steps > 0:
+            self.members = Members(model, config, sampler, generator)
+            rate, taught = config.latent_learning_rate, (model.global_policy, model.global_critic)
+            self.member_optimizers = {
+                "member_critics": adam(self.members.critics.parameters(), rate),
+                "member_policies": adam(self.members.policies.parameters(), rate),
+                "distil": adam([p for module in taught for p in module.parameters()], rate),
+            }
         self.clone_optimizer, self.clones = None, None
         if config.clone_steps > 0:
             assert model.success_policy is not None, "clone_steps asks for success_policy"
@@ -110,7 +121,7 @@ class JointLearner:
     def companions(self) -> dict[str, nn.Module]:
         """Target critics by name, and what is thrown away in the end."""
         extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions,
-                 "clones": self.clones}
+                 "clones": self.clones, "members": self.members}
         kept = {name: module for name, module in extra.items() if module is not None}
         return {"local": self.local_target, "global": self.global_target, **kept}
 
@@ -119,7 +130,7 @@ class JointLearner:
         """Optimisers by name."""
         extra = {"pairs": self.pair_optimizer, "clone": self.clone_optimizer}
         kept = {name: optimizer for name, optimizer in extra.items() if optimizer is not None}
-        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **kept}
+        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **kept, **self.member_optimizers}
 
     def _optimise(self, learning_rate: float, encoder: bool) -> None:
         """Fresh optimisers; the encoder is left out in the latent phase."""
@@ -246,6 +257,44 @@ class JointLearner:
             loss.backward()
             return {**info, **self._step(latents, batch, policies)}
 
+    def member_step(self) -> Info:
+        """One update of the members' critics, and of their policies in their turn, on cached latents (ours)."""
+        return self._run_in_turn("members", self._update_members)
+
+    def _update_members(self, policies: bool) -> Info:
+        members, cache = self.members, self.cache
+        assert members is not None and cache is not None, "member_steps is 0, or begin_latent_phase is still to come"
+        critics, acting = (self.member_optimizers[f"member_{name}"] for name in ("critics", "policies"))
+        rows = members.draw(members.count, self.generator)
+        with one_thread(rows.device, rows.numel() <= TRANSITIONS_A_THREAD):
+            critics.zero_grad(set_to_none=True)
+            loss, info = members.value_loss(cache, rows)
+            loss.backward()
+            critics.step()
+            members.follow()
+            if not policies:
+                return info
+            acting.zero_grad(set_to_none=True)
+            loss, more = members.acting_loss(cache, rows)
+            loss.backward(inputs=list(members.policies.parameters()))
+            acting.step()
+            return {**info, **more}
+
+    def distil_step(self) -> Info:
+        """One update of π^g and Q^g towards the members' mean, on cached latents (ours)."""
+        return self._run("distil", self._update_distilled)
+
+    def _update_distilled(self) -> Info:
+        members, cache, optimizer = self.members, self.cache, self.member_optimizers["distil"]
+        assert members is not None and cache is not None, "member_steps is 0, or begin_latent_phase is still to come"
+        rows = members.draw(1, self.generator)[0]
+        optimizer.zero_grad(set_to_none=True)
+        with one_thread(rows.device, members.count * len(rows) <= TRANSITIONS_A_THREAD):
+            loss, info = members.distil_loss(self.model, cache, rows)
+            loss.backward()
+            optimizer.step()
+        return info
+
     def clone_step(self, done: int, steps: int) -> Info:
         """Update `done` of the `steps` that clone policies from successes, on cached latents: mean-squared error as in D.1
         (ours). The last one leaves the best of `clone_candidates` in the model."""
@@ -285,7 +334,9 @@ class JointLearner:
         if phase == "clone":
             return self.clone_step(done, steps)
         self.set_learning_rate(self.config.latent_learning_rate * cosine(done / steps))
-        return {"latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step}[phase]()
+        steps_of = {"latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step,
+                    "members": self.member_step, "distil": self.distil_step}
+        return steps_of[phase]()
 
     def _run_in_turn(self, name: str, update: Callable[[bool], Info], capture: bool = True) -> Info:
         """`update(policies)`, where the policies learn in every `policy_every`-th update."""

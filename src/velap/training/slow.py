@@ -4,7 +4,7 @@ What a scene is (where a drawer stands, how far it is open) changes slowly or no
 of the moments' variance: an arm covers more. Slow feature analysis (Wiskott and Sejnowski 2002) finds the directions of the
 moments that change least in a few steps, each with variance one, so that a drawer counts as much as an arm.
 
-F frames of the data, C moments, P pairs, D latent.
+F frames of the data, C moments, S slow features, P pairs.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ def fit_palette(encoder: MomentEncoder, sampler: WindowSampler, seed: int) -> No
     encoder.moments.fit(frames.cpu().numpy(), seed)
 
 
-def slow_features(moments: Tensor, last: Tensor, count: int = SLOW) -> Tensor:
-    """The `count` linear features of moments [F, C] that change least, zero mean and variance one: [F, count].
+def slow_features(moments: Tensor, last: Tensor, count: int = SLOW) -> tuple[Tensor, Tensor]:
+    """The `count` linear features of moments [F, C] that change least: mean [C] and directions [C, count], so that
+    (moments - mean) @ directions has zero mean and variance one.
 
     last: int64 [F], last row of each row's episode. Where no episode is longer than `LAG`, each row is compared with that.
     """
@@ -52,13 +53,14 @@ def slow_features(moments: Tensor, last: Tensor, count: int = SLOW) -> Tensor:
     if bool((rows + LAG <= last).any()):
         kept = rows + LAG <= last
         rows, ahead = rows[kept], ahead[kept]
-    centred = moments - moments.mean(0)
+    mean = moments.mean(0)
+    centred = moments - mean
     change = moments[ahead] - moments[rows]
     ridge = RIDGE * np.eye(moments.shape[1])
     spread, fast = (part.T @ part / len(part) for part in (centred, change))
-    _, directions = eigh(fast.double().cpu().numpy() + ridge, spread.double().cpu().numpy() + ridge)
-    features = centred @ torch.from_numpy(directions[:, :count]).to(moments)
-    return features / features.std(0).clamp(min=1e-6)
+    _, found = eigh(fast.double().cpu().numpy() + ridge, spread.double().cpu().numpy() + ridge)
+    directions = torch.from_numpy(found[:, :count]).to(moments)
+    return mean, directions / (centred @ directions).std(0).clamp(min=1e-6)
 
 
 class MomentObjective(Pairs):
@@ -69,8 +71,9 @@ class MomentObjective(Pairs):
 
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         super().__init__(model, config, sampler, generator)
-        latent, moments = model.config.latent_dim, 6 * model.config.moment_colours
-        self.slow = min(SLOW, moments)
+        moments = 6 * model.config.moment_colours
+        latent = self.learnt_dim(model)
+        self.slow = min(max(SLOW, model.config.slow_features), moments)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(generator.initial_seed() + 1)
             self.moments_head = MLP(latent, self.HIDDEN_MOMENTS, moments, "layer").to(sampler.device)
@@ -86,7 +89,9 @@ class MomentObjective(Pairs):
         assert isinstance(model.encoder, MomentEncoder), "moment_colours is 0"
         sampler = self.sampler
         measured = all_moments(model.encoder, sampler)
-        features = slow_features(measured, sampler.last, self.slow)
+        middle, directions = slow_features(measured, sampler.last, self.slow)
+        model.encoder.keep_slow(middle, directions)
+        features = (measured - middle) @ directions
         numbers = torch.unique(sampler.first, return_inverse=True)[1]
         sums = torch.zeros(int(numbers.max()) + 1, self.slow, device=sampler.device).index_add_(0, numbers, features)
         mean = (sums / torch.bincount(numbers).unsqueeze(1))[numbers]
@@ -106,7 +111,7 @@ class MomentObjective(Pairs):
         assert self.measured is not None, "prepare comes first"
         now, then = self.draw(generator)
         rows = torch.cat([now, then])
-        latents = model.encoder.from_moments(self.stacked(rows))
+        latents = model.encoder.learnt(self.stacked(rows))
         displacement, error = self.displacement(latents, now, then)
         moments = (self.moments_head(latents) - self.measured[rows]).square().mean()
         mean, rest = (self.slow_head(latents) - self.slow_targets[rows]).square().chunk(2, -1)

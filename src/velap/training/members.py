@@ -1,0 +1,102 @@
+"""Several π^g, each with critics of its own, whose mean becomes the model's (ours).
+
+Where a policy goes from a state that the data hardly hold is an accident of its first weights, and a task of many steps
+meets such states. What several policies agree on is no accident; the mean of their actions is taught to the one policy of
+the model, so that nothing acts slower.
+
+E members, B transitions of each, F frames, D latent, A action dimension.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from torch import Tensor, nn
+
+from velap.data.windows import WindowSampler
+from velap.models.latent import UNREWARDED, LatentModel
+from velap.models.networks import EnsembleMLP
+from velap.train_config import TrainConfig
+from velap.training.losses import (
+    Info,
+    cloning_error,
+    critic_loss,
+    cross_entropy_critic_loss,
+    policy_loss,
+    polyak,
+    td_target,
+)
+
+
+class Members(nn.Module):
+    """E pairs of policy and critics that learn Eq. 4 and 5 on cached latents; each draws transitions of its own."""
+
+    def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
+        super().__init__()
+        self.config, self.sampler, self.bound = config, sampler, model.bound
+        shape, action = model.config, model.action_dim
+        latent = shape.width(action)
+        self.count, self.n_global = config.members, shape.n_global
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(generator.initial_seed() + 2)
+            self.policies = EnsembleMLP(self.count, latent, shape.policy_dense, shape.norm, action)
+            self.critics = EnsembleMLP(self.count * self.n_global, latent + action, shape.critic_dense, shape.norm)
+        if shape.critic_bounded:
+            nn.init.constant_(self.critics.biases[-1], UNREWARDED)
+        self.target = copy.deepcopy(self.critics).requires_grad_(False)
+        self.to(sampler.device)
+        self.error = cross_entropy_critic_loss if config.critic_loss == "cross_entropy" else critic_loss
+
+    def draw(self, members: int, generator: torch.Generator) -> Tensor:
+        """Rows of transitions from all over the data: int64 [members, B]."""
+        pool = self.sampler.transitions
+        return pool[torch.randint(len(pool), (members, self.config.latent_value_batch), generator=generator,
+                                  device=pool.device)]
+
+    def act(self, latents: Tensor) -> Tensor:
+        """Each member's action: [E, B, D] → [E, B, A] in [-1, 1]."""
+        return torch.tanh(self.policies.each(latents))
+
+    def qs(self, critics: EnsembleMLP, latents: Tensor, actions: Tensor) -> Tensor:
+        """Each member's critics: [E, B, D], [E, B, A] → [E, n_global, B] [Q-value]."""
+        joined = torch.cat([latents, actions], -1).repeat_interleave(self.n_global, 0)
+        return self.bound(critics.each(joined).squeeze(-1)).view(self.count, self.n_global, -1)
+
+    def value_loss(self, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
+        """Eq. 4 of every member. cache [F, D], rows int64 [E, B]."""
+        sampler, weight = self.sampler, torch.ones(rows.shape[1], device=rows.device)
+        with torch.no_grad():
+            then = cache[rows + 1]
+            next_q = self.qs(self.target, then, self.act(then)).amin(1)
+            goal = td_target(sampler.rewards[rows], (~sampler.terminated[rows]).float(), next_q, self.config.discount)
+        loss, info = self.error(self.qs(self.critics, cache[rows], sampler.actions[rows]), goal.unsqueeze(1), weight)
+        return loss, {"members/loss": info["loss"], "members/q": info["q"]}
+
+    def acting_loss(self, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
+        """Eq. 5 of every member. cache [F, D], rows int64 [E, B]."""
+        latents = cache[rows]
+        action = self.act(latents)
+        q = self.qs(self.critics, latents, action).amin(1)
+        weight = torch.ones(rows.shape[1], device=rows.device)
+        loss, info = policy_loss(q, action, self.sampler.actions[rows], self.config.c3, weight,
+                                 relative=self.config.policy_relative)
+        return loss, {"members/policy": info["loss"], "members/imitation": info["imitation"]}
+
+    def follow(self) -> None:
+        """Targets after the critics."""
+        polyak(list(self.target.parameters()), list(self.critics.parameters()), self.config.target_rate)
+
+    def distil_loss(self, model: LatentModel, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
+        """The model's π^g against the mean action, and its Q^g against the mean of the members' minima, at the data's and at
+        π^g's own actions. cache [F, D], rows int64 [B]."""
+        latents = cache[rows]
+        action = model.act_global(latents)
+        at = torch.cat([self.sampler.actions[rows], action.detach()])
+        with torch.no_grad():
+            every = latents.expand(self.count, -1, -1)
+            mean = self.act(every).mean(0)
+            value = self.qs(self.critics, every.repeat(1, 2, 1), at.expand(self.count, -1, -1)).amin(1).mean(0)
+        acting = cloning_error(action, mean).mean()
+        values, _ = self.error(model.global_qs(latents.repeat(2, 1), at), value, torch.ones_like(value))
+        return acting + values, {"distil/policy": acting.detach(), "distil/q": values.detach()}
