@@ -138,11 +138,11 @@ class TrainConfig:
     """Transitions a batch of those. ours."""
     member_steps: int = 0
     """Updates of `members` π^g with critics of their own after the values, on cached latents; 0 has none [steps]. ours:
-    where the data are thin, what one policy does is luck; the mean of several is less so."""
+    where the data are thin, what one policy does is luck; the median of several is less so."""
     members: int = 4
     """Those policies. ours."""
     distil_steps: int = 0
-    """Updates that teach the members' mean action and value to the model's π^g and Q^g [steps]. ours."""
+    """Updates that teach the members' median action and mean value to the model's π^g and Q^g [steps]. ours."""
     latent_heads: bool = True
     """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
     clone_steps: int = 0

@@ -281,7 +281,7 @@ class JointLearner:
             return {**info, **more}
 
     def distil_step(self) -> Info:
-        """One update of π^g and Q^g towards the members' mean, on cached latents (ours)."""
+        """One update of π^g and Q^g towards the members' median and mean, on cached latents (ours)."""
         return self._run("distil", self._update_distilled)
 
     def _update_distilled(self) -> Info:

@@ -1,8 +1,8 @@
-"""Several π^g, each with critics of its own, whose mean becomes the model's (ours).
+"""Several π^g, each with critics of its own, whose median becomes the model's (ours).
 
 Where a policy goes from a state that the data hardly hold is an accident of its first weights, and a task of many steps
-meets such states. What several policies agree on is no accident; the mean of their actions is taught to the one policy of
-the model, so that nothing acts slower.
+meets such states. What several policies agree on is no accident; the median of their actions is taught to the one policy
+of the model, so that nothing acts slower.
 
 E members, B transitions of each, F frames, D latent, A action dimension.
 """
@@ -27,6 +27,9 @@ from velap.training.losses import (
     polyak,
     td_target,
 )
+
+CLOSE = 1e-4
+"""Squared distance of actions, averaged over A, within which the distance has no edge."""
 
 
 class Members(nn.Module):
@@ -88,15 +91,18 @@ class Members(nn.Module):
         polyak(list(self.target.parameters()), list(self.critics.parameters()), self.config.target_rate)
 
     def distil_loss(self, model: LatentModel, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
-        """The model's π^g against the mean action, and its Q^g against the mean of the members' minima, at the data's and at
-        π^g's own actions. cache [F, D], rows int64 [B]."""
+        """The model's π^g against the members' actions, by distance and not by its square: it learns their median, and one that
+        stands alone is not heard. Q^g against the mean of their minima, at the data's and at π^g's own actions.
+
+        cache [F, D], rows int64 [B].
+        """
         latents = cache[rows]
         action = model.act_global(latents)
         at = torch.cat([self.sampler.actions[rows], action.detach()])
         with torch.no_grad():
             every = latents.expand(self.count, -1, -1)
-            mean = self.act(every).mean(0)
+            actions = self.act(every)
             value = self.qs(self.critics, every.repeat(1, 2, 1), at.expand(self.count, -1, -1)).amin(1).mean(0)
-        acting = cloning_error(action, mean).mean()
+        acting = (cloning_error(action, actions) + CLOSE).sqrt().mean()
         values, _ = self.error(model.global_qs(latents.repeat(2, 1), at), value, torch.ones_like(value))
         return acting + values, {"distil/policy": acting.detach(), "distil/q": values.detach()}
