@@ -12,8 +12,8 @@ from velap.config import ModelConfig
 from velap.data.windows import WindowSampler
 from velap.errors import ConfigError
 from velap.models.latent import LatentModel, Spaces, load_checkpoint
-from velap.models.moments import LIMIT, ColourMoments, MomentEncoder
-from velap.training.latents import encode_all, encode_rows
+from velap.models.moments import LIMIT, SLOW_LIMIT, SLOW_SCALE, ColourMoments, MomentEncoder
+from velap.training.latents import all_moments, encode_all, encode_rows
 from velap.training.loop import Trainer
 from velap.training.slow import LAG, MomentObjective, fit_palette, slow_features
 
@@ -139,6 +139,46 @@ def test_a_training_with_moments_resumes_to_the_same_bits_and_is_read_again(tmp_
     read, _, _ = load_checkpoint(second.finish("test").checkpoint)
     assert isinstance(read.encoder, MomentEncoder)
     assert torch.equal(read.encoder.moments.palette, second.model.encoder.moments.palette)
+
+
+SLOWLY = dataclasses.replace(SEEING, latent_dim=SEEING.latent_dim + 3, slow_features=3)
+
+
+def test_slow_features_stand_behind_what_is_learnt_and_stay_as_they_are(tmp_path: Path):
+    settings = config(SLOWLY, encoder_steps=3, joint_steps=2, latent_steps=1)
+    run = Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
+    encoder, rows = run.model.encoder, torch.arange(len(run.sampler.frames))
+    assert isinstance(encoder, MomentEncoder)
+    assert not encoder.slow_directions.any()  # they are found with the first update
+    run.update()
+    moments = all_moments(encoder, run.sampler)
+    mean, directions = slow_features(moments, run.sampler.last, 3)
+    expected = SLOW_SCALE * (moments - mean) @ directions
+    for _ in range(2):  # the joint phase and the heads from new weights change what is learnt alone
+        latents = encode_all(run.model, run.sampler)
+        assert latents.shape == (len(rows), SLOWLY.latent_dim)
+        torch.testing.assert_close(latents[:, -3:], expected.clamp(-SLOW_LIMIT, SLOW_LIMIT), atol=1e-4, rtol=1e-4)
+        stacks = torch.stack([moments, moments], 1)
+        torch.testing.assert_close(encoder.from_moments(stacks)[:, :-3], encoder.learnt(stacks))
+        while run.step < run.total:
+            run.update()
+
+
+@pytest.mark.parametrize("stop", [1, 3])
+def test_a_training_with_slow_features_resumes_to_the_same_bits(tmp_path: Path, stop: int):
+    straight_and_resumed(tmp_path, config(SLOWLY, encoder_steps=2, joint_steps=1, latent_steps=2, heads_afresh=True), stop)
+
+
+@pytest.mark.parametrize("fields", [{"slow_features": 3}, {"moment_colours": 4, "slow_features": 32},
+                                    {"moment_colours": 1, "slow_features": 7}])
+def test_more_slow_features_than_there_can_be_are_refused(fields):
+    with pytest.raises(ConfigError, match="slow_features"):
+        ModelConfig(**fields)
+
+
+def test_slow_features_ask_for_an_encoder_phase():
+    with pytest.raises(ConfigError, match="encoder_steps"):
+        config(SLOWLY)
 
 
 @pytest.mark.parametrize("colours", [-1, 257])

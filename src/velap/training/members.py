@@ -91,7 +91,7 @@ class Members(nn.Module):
         polyak(list(self.target.parameters()), list(self.critics.parameters()), self.config.target_rate)
 
     def distil_loss(self, model: LatentModel, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
-        """The model's π^g against the members' actions, by distance and not by its square: it learns their median, and one that
+        """The model's π^g against the members' actions, by distance, not by its square: it learns their median, and one that
         stands alone is not heard. Q^g against the mean of their minima, at the data's and at π^g's own actions.
 
         cache [F, D], rows int64 [B].
