@@ -132,6 +132,23 @@ _MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
 """ours: places come from colour moments, the hand's speed from the past actions, and all else is learnt on frozen latents.
 π^g is good on those, and leads wherever Q^g sees the goal within 150 steps; the tree leads from farther away."""
 
+_MEMBERS_DEFAULTS: dict[str, dict[str, Any]] = {
+    **_MOMENTS_DEFAULTS,
+    "model": {**_MOMENTS_DEFAULTS["model"], "success_policy": False, "latent_dim": 64, "slow_features": 32},
+    "train": {
+        **_MOMENTS_DEFAULTS["train"],
+        "clone_steps": 0,
+        "c3": 1.0,
+        "latent_value_steps": 0,
+        "member_steps": 5_000,
+        "members": 5,
+        "distil_steps": 3_000,
+    },
+    "controller": {**_MOMENTS_DEFAULTS["controller"], "success_rollout": 0, "goal_lookahead": 0, "revisit_penalty": 8.0},
+}
+"""ours: slow features tell where things stand, and π^g is the median of five that imitate more and learn no longer than they
+gain by it. It leads; the tree takes over where the hand is stuck, which a high price of revisits says soon."""
+
 TASKS: dict[str, Task] = {
     task.name: task
     for task in (
@@ -200,7 +217,7 @@ TASKS: dict[str, Task] = {
             overrides={
                 "train": {"c3": 0.5},
             },
-            default_overrides=_SAWYER_DEFAULTS,
+            default_overrides=_MEMBERS_DEFAULTS,
         ),
         Task(
             name="FaucetClose",
