@@ -124,7 +124,7 @@ def test_the_minutes_of_a_training_are_updates_over_the_rate_of_their_phase(monk
         """An update of the encoder phase takes 0.1 s, one of the joint phase 0.4 s, the first of each a minute more."""
 
         device = CPU
-        config = override(make_config("WindowClose"), train={"encoder_steps": 600, "joint_steps": 300, "latent_steps": 0,
+        config = override(make_config("FaucetClose"), train={"encoder_steps": 600, "joint_steps": 300, "latent_steps": 0,
                                                              "clone_steps": 0})
         step = 0
 

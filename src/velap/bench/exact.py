@@ -144,7 +144,8 @@ def learn(data: States, config: Config, seed: int, view: View | None = None) -> 
     spaces = Spaces(SIDE, SIDE, tuple(map(float, store.action_low)), tuple(map(float, store.action_high)))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        blind = dataclasses.replace(config.model, command_memory=0.0)  # the true state holds the hand's speed
+        # the true state holds the speed of the hand, and there is no picture to measure
+        blind = dataclasses.replace(config.model, command_memory=0.0, moment_colours=0, slow_features=0)
         model = LatentModel(blind, spaces, train.discount, train.precision).train()
     model.encode = ExactEncoder(data, config.model.latent_dim)  # type: ignore[method-assign]
     learner = JointLearner(model, train, sampler, make_generator(seed, stream=1, device=device))

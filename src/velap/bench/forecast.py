@@ -52,6 +52,10 @@ DYNAMICS_UPDATE_SECONDS = 0.017
 """One update of h alone on frozen latents [s]."""
 VALUE_UPDATE_SECONDS = 0.029
 """One update of critics and policies alone on frozen latents [s]."""
+MEMBER_UPDATE_SECONDS = 0.011
+"""Of the members' phase, for each member [s]."""
+DISTIL_UPDATE_SECONDS = 0.015
+"""Of the phase after it [s]."""
 CLONE_UPDATE_SECONDS = 0.005
 """One update of the policy cloned from successes [s]."""
 HEAD_UPDATE_SECONDS = {"bc": 0.0020, "bc-success": 0.0008, "iql": 0.0115, "iql-sparse": 0.0115, "iris": 0.0095,
@@ -128,6 +132,8 @@ def calibrated(job: Job) -> float:
             train.latent_steps * LATENT_UPDATE_SECONDS
             + train.latent_dynamics_steps * DYNAMICS_UPDATE_SECONDS
             + train.latent_value_steps * VALUE_UPDATE_SECONDS
+            + train.member_steps * train.members * MEMBER_UPDATE_SECONDS
+            + train.distil_steps * DISTIL_UPDATE_SECONDS
             + train.clone_steps * CLONE_UPDATE_SECONDS
         )
         return START_SECONDS + encoded * frame + frozen
