@@ -57,7 +57,7 @@ def test_members_begin_apart_and_leave_the_model_alone(tmp_path):
     assert (actions[0] - actions[1]).abs().amax() > 1e-3 and (actions[1] - actions[2]).abs().amax() > 1e-3
 
 
-def test_each_members_loss_is_that_of_its_own_critics_and_policy(tmp_path):
+def test_each_member_learns_from_its_own_critics(tmp_path):
     members = (run := trained(tmp_path, 3)).learner.members
     cache, rows = run.learner.cache, members.draw(3, run.learner.generator)
     members.zero_grad()

@@ -145,7 +145,7 @@ SLOWLY = dataclasses.replace(SEEING, latent_dim=SEEING.latent_dim + 3, slow_feat
 
 
 def test_slow_features_stand_behind_what_is_learnt_and_stay_as_they_are(tmp_path: Path):
-    settings = config(SLOWLY, encoder_steps=3, joint_steps=2, latent_steps=1)
+    settings = config(SLOWLY, encoder_steps=3, joint_steps=2, latent_steps=1, heads_afresh=True)
     run = Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
     encoder, rows = run.model.encoder, torch.arange(len(run.sampler.frames))
     assert isinstance(encoder, MomentEncoder)

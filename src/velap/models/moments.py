@@ -97,8 +97,8 @@ class MomentEncoder(nn.Module):
         moments, learnt = 6 * config.moment_colours, config.latent_dim - config.slow_features
         self.dense = MLP(moments * config.frame_stack, config.encoder_dense, learnt, config.norm)
         self.final_norm = nn.LayerNorm(learnt, elementwise_affine=False) if config.latent_norm else nn.Identity()
-        self.latent_dim, self.learnt_dim = config.latent_dim, learnt
-        """Dimensions of the latent that the dense layers give; the slow features are the rest."""
+        self.slow_features = config.slow_features
+        """S, the last dimensions of the latent."""
         if config.slow_features > 0:
             self.register_buffer("slow_mean", torch.zeros(moments))
             self.register_buffer("slow_directions", torch.zeros(moments, config.slow_features))
@@ -115,7 +115,7 @@ class MomentEncoder(nn.Module):
     def from_moments(self, moments: Tensor) -> Tensor:
         """Standardised moments of a stack [M, N, C] → [M, D]."""
         learnt = self.learnt(moments)
-        if self.learnt_dim == self.latent_dim:
+        if self.slow_features == 0:
             return learnt
         slow = (moments[:, -1] - self.slow_mean) @ self.slow_directions
         return torch.cat([learnt, slow.clamp(-SLOW_LIMIT, SLOW_LIMIT)], -1)
@@ -128,6 +128,6 @@ class MomentEncoder(nn.Module):
     @torch.no_grad()
     def keep_slow(self, mean: Tensor, directions: Tensor) -> None:
         """Take the slow features of moments [M, C] to be (moments - mean) @ directions: [C], [C, S], variance one."""
-        if self.learnt_dim < self.latent_dim:
+        if self.slow_features > 0:
             self.slow_mean.copy_(mean)
-            self.slow_directions.copy_(SLOW_SCALE * directions[:, : self.latent_dim - self.learnt_dim])
+            self.slow_directions.copy_(SLOW_SCALE * directions[:, : self.slow_features])

@@ -83,15 +83,8 @@ class JointLearner:
             objective = MomentObjective if isinstance(model.encoder, MomentEncoder) else PairObjective
             self.pairs = objective(model, config, sampler, generator)
         self.members: Members | None = None
-        self.member_optimizers: dict[str, torch.optim.Optimizer] = {}
         if config.member_steps > 0:
             self.members = Members(model, config, sampler, generator)
-            rate, taught = config.latent_learning_rate, (model.global_policy, model.global_critic)
-            self.member_optimizers = {
-                "member_critics": adam(self.members.critics.parameters(), rate),
-                "member_policies": adam(self.members.policies.parameters(), rate),
-                "distil": adam([p for module in taught for p in module.parameters()], rate),
-            }
         self.clone_optimizer, self.clones = None, None
         if config.clone_steps > 0:
             assert model.success_policy is not None, "clone_steps asks for success_policy"
@@ -130,7 +123,8 @@ class JointLearner:
         """Optimisers by name."""
         extra = {"pairs": self.pair_optimizer, "clone": self.clone_optimizer}
         kept = {name: optimizer for name, optimizer in extra.items() if optimizer is not None}
-        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **kept, **self.member_optimizers}
+        own = {} if self.members is None else self.members.optimizers
+        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **kept, **own}
 
     def _optimise(self, learning_rate: float, encoder: bool) -> None:
         """Fresh optimisers; the encoder is left out in the latent phase."""
@@ -259,41 +253,15 @@ class JointLearner:
 
     def member_step(self) -> Info:
         """One update of the members' critics, and of their policies in their turn, on cached latents (ours)."""
-        return self._run_in_turn("members", self._update_members)
-
-    def _update_members(self, policies: bool) -> Info:
         members, cache = self.members, self.cache
         assert members is not None and cache is not None, "member_steps is 0, or begin_latent_phase is still to come"
-        critics, acting = (self.member_optimizers[f"member_{name}"] for name in ("critics", "policies"))
-        rows = members.draw(members.count, self.generator)
-        with one_thread(rows.device, rows.numel() <= TRANSITIONS_A_THREAD):
-            critics.zero_grad(set_to_none=True)
-            loss, info = members.value_loss(cache, rows)
-            loss.backward()
-            critics.step()
-            members.follow()
-            if not policies:
-                return info
-            acting.zero_grad(set_to_none=True)
-            loss, more = members.acting_loss(cache, rows)
-            loss.backward(inputs=list(members.policies.parameters()))
-            acting.step()
-            return {**info, **more}
+        return self._run_in_turn("members", lambda policies: members.update(cache, policies, self.generator))
 
     def distil_step(self) -> Info:
         """One update of π^g and Q^g towards the members' median and mean, on cached latents (ours)."""
-        return self._run("distil", self._update_distilled)
-
-    def _update_distilled(self) -> Info:
-        members, cache, optimizer = self.members, self.cache, self.member_optimizers["distil"]
+        members, cache = self.members, self.cache
         assert members is not None and cache is not None, "member_steps is 0, or begin_latent_phase is still to come"
-        rows = members.draw(1, self.generator)[0]
-        optimizer.zero_grad(set_to_none=True)
-        with one_thread(rows.device, members.count * len(rows) <= TRANSITIONS_A_THREAD):
-            loss, info = members.distil_loss(self.model, cache, rows)
-            loss.backward()
-            optimizer.step()
-        return info
+        return self._run("distil", lambda: members.distil(self.model, cache, self.generator))
 
     def clone_step(self, done: int, steps: int) -> Info:
         """Update `done` of the `steps` that clone policies from successes, on cached latents: mean-squared error as in D.1

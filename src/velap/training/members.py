@@ -18,6 +18,7 @@ from velap.data.windows import WindowSampler
 from velap.models.latent import UNREWARDED, LatentModel
 from velap.models.networks import EnsembleMLP
 from velap.train_config import TrainConfig
+from velap.training.capture import adam
 from velap.training.losses import (
     Info,
     cloning_error,
@@ -49,7 +50,41 @@ class Members(nn.Module):
             nn.init.constant_(self.critics.biases[-1], UNREWARDED)
         self.target = copy.deepcopy(self.critics).requires_grad_(False)
         self.to(sampler.device)
+        taught = (model.global_policy, model.global_critic)
+        learnt = {
+            "member_critics": [*self.critics.parameters()],
+            "member_policies": [*self.policies.parameters()],
+            "distil": [p for module in taught for p in module.parameters()],
+        }
+        self.optimizers = {name: adam(parameters, config.latent_learning_rate) for name, parameters in learnt.items()}
+        """By name."""
         self.error = cross_entropy_critic_loss if config.critic_loss == "cross_entropy" else critic_loss
+
+    def update(self, cache: Tensor, policies: bool, generator: torch.Generator) -> Info:
+        """One update of the critics, and of the policies where it is their turn. cache [F, D]."""
+        critics, acting = self.optimizers["member_critics"], self.optimizers["member_policies"]
+        rows = self.draw(self.count, generator)
+        critics.zero_grad(set_to_none=True)
+        loss, info = self.value_loss(cache, rows)
+        loss.backward()
+        critics.step()
+        polyak(list(self.target.parameters()), list(self.critics.parameters()), self.config.target_rate)
+        if not policies:
+            return info
+        acting.zero_grad(set_to_none=True)
+        loss, more = self.acting_loss(cache, rows)
+        loss.backward(inputs=list(self.policies.parameters()))
+        acting.step()
+        return {**info, **more}
+
+    def distil(self, model: LatentModel, cache: Tensor, generator: torch.Generator) -> Info:
+        """One update of the model's π^g and Q^g. cache [F, D]."""
+        optimizer = self.optimizers["distil"]
+        optimizer.zero_grad(set_to_none=True)
+        loss, info = self.distil_loss(model, cache, self.draw(1, generator)[0])
+        loss.backward()
+        optimizer.step()
+        return info
 
     def draw(self, members: int, generator: torch.Generator) -> Tensor:
         """Rows of transitions from all over the data: int64 [members, B]."""
@@ -85,10 +120,6 @@ class Members(nn.Module):
         loss, info = policy_loss(q, action, self.sampler.actions[rows], self.config.c3, weight,
                                  relative=self.config.policy_relative)
         return loss, {"members/policy": info["loss"], "members/imitation": info["imitation"]}
-
-    def follow(self) -> None:
-        """Targets after the critics."""
-        polyak(list(self.target.parameters()), list(self.critics.parameters()), self.config.target_rate)
 
     def distil_loss(self, model: LatentModel, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
         """The model's π^g against the members' actions, by distance, not by its square: it learns their median, and one that
