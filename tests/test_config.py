@@ -106,3 +106,5 @@ def test_cross_entropy_asks_for_bounded_critics():
     with pytest.raises(ConfigError, match="critic_bounded"):
         override(config, train={"critic_loss": "cross_entropy"}, model={"critic_bounded": False})
     assert override(config, train={"critic_loss": "cross_entropy"}).hash() != config.hash()
+    with pytest.raises(ConfigError, match="critic_floor"):
+        override(config, train={"critic_loss": "mse", "critic_floor": 0.01})

@@ -63,6 +63,33 @@ def test_cross_entropy_is_zero_at_the_target_and_pulls_far_values_as_hard_as_nea
     assert cross_entropy_critic_loss(tensor([1.0, 0.0]), tensor([1.0, 0.0]), ONES)[0].item() == 0
 
 
+def test_with_a_floor_a_step_too_many_counts_alike_far_from_the_goal_and_near_it():
+    target = tensor([0.5, 0.05, 0.002])
+    q = (0.96 * target).requires_grad_()
+    gradient = {}
+    for floor in (0.0, 1e-6, 0.002):
+        loss, _ = cross_entropy_critic_loss(q, target, torch.ones(3), floor)
+        (grad,) = torch.autograd.grad(loss, q)
+        gradient[floor] = -(grad * target)  # by the logarithm of q, which is steps
+    assert gradient[0.0][0] > 5 * gradient[0.0][1] > 50 * gradient[0.0][2]
+    # q (1 - q) is what is left of the sigmoid: half of it at 0.5
+    torch.testing.assert_close(gradient[1e-6] * (1 - q.detach()), gradient[1e-6][2].expand(3), rtol=0.03, atol=0)
+    assert gradient[0.002][2] == pytest.approx(gradient[0.002][1].item() / 2, rel=0.1)
+
+
+def test_the_floor_weighs_real_transitions_only_and_keeps_the_size_of_the_loss():
+    q, target = tensor([[0.4, 0.02, 0.9], [0.5, 0.01, 0.1]]), tensor([0.5, 0.01, 0.001])
+    real = tensor([1.0, 1.0, 0.0])
+    loss, _ = cross_entropy_critic_loss(q, target, real, 0.005)
+    alone, _ = cross_entropy_critic_loss(q[:, :2], target[:2], torch.ones(2), 0.005)
+    assert loss.item() == pytest.approx(alone.item())
+    same = tensor([0.3, 0.3])
+    plain = cross_entropy_critic_loss(tensor([0.2, 0.4]), same, ONES)[0]
+    assert cross_entropy_critic_loss(tensor([0.2, 0.4]), same, ONES, 0.005)[0].item() == pytest.approx(plain.item())
+    members = cross_entropy_critic_loss(q[:, :2].expand(3, 2, 2), target[:2].expand(3, 1, 2), torch.ones(2), 0.005)[0]
+    assert members.item() == pytest.approx(alone.item())
+
+
 def test_a_relative_policy_loss_counts_values_in_their_own_size():
     action, data = torch.zeros(2, 2), tensor([[0.0, 0.0], [0.0, 2.0]])
     q = tensor([0.001, 0.5], requires_grad=True)

@@ -343,6 +343,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "clone_steps",
         "clone_candidates",
         "critic_loss",
+        "critic_floor",
         "policy_relative",
         "group_windows",
         "group_reach",

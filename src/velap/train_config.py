@@ -84,6 +84,9 @@ class TrainConfig:
     critic_loss: CriticLoss = "mse"
     """Loss of the critics: Eq. 3 and 4, or the cross entropy of bounded ones. ours: squared errors of far states' values,
     hundredths, teach nothing."""
+    critic_floor: float = 0.0
+    """With more than 0, a transition counts in the cross entropy of the global critics by 1 / (its target + this); 0 counts
+    all alike [Q-value]. ours: Q far from the goal is small and its errors are too, but an action there is chosen by them."""
     policy_relative: bool = False
     """The policies gain by Q in its own size instead of Q (Eq. 5). ours: far from the goal Q is small, and imitation would
     be all that counts."""
@@ -227,6 +230,12 @@ class TrainConfig:
         require(self.precision in get_args(Precision), "precision", self.precision, f"one of {get_args(Precision)}")
         require(
             self.critic_loss in get_args(CriticLoss), "critic_loss", self.critic_loss, f"one of {get_args(CriticLoss)}"
+        )
+        require(
+            0 <= self.critic_floor <= 1 and (self.critic_floor == 0 or self.critic_loss == "cross_entropy"),
+            "critic_floor",
+            self.critic_floor,
+            "0 to 1, and 0 where `critic_loss` is not 'cross_entropy'",
         )
 
     @property

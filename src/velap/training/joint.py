@@ -28,8 +28,7 @@ from velap.training.losses import (
     Info,
     action_model_loss,
     cloning_error,
-    critic_loss,
-    cross_entropy_critic_loss,
+    critic_error,
     infonce_loss,
     policy_loss,
     polyak,
@@ -366,8 +365,8 @@ class JointLearner:
             local_goal = td_target(batch.goals.reward, batch.goals.proceeds, next_local, config.discount)
             next_global = model.bound(self.global_target(torch.cat([then, model.act_global(then)], -1))).amin(0)
             global_goal = td_target(batch.reward, batch.proceeds, next_global, config.discount)
-        error = cross_entropy_critic_loss if config.critic_loss == "cross_entropy" else critic_loss
-        local, local_info = error(model.local_q(now, goal, batch.action), local_goal, weight)
+        local, local_info = critic_error(config.critic_loss)(model.local_q(now, goal, batch.action), local_goal, weight)
+        error = critic_error(config.critic_loss, config.critic_floor)
         task, task_info = error(model.global_qs(now, batch.action), global_goal, weight)
         info = {
             "local/loss": local_info["loss"],

@@ -6,12 +6,14 @@ Letters: T transitions, n ensemble members, k rollout steps, W rollouts, C candi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from velap.models.horizon import Q_FLOOR
+from velap.train_config import CriticLoss
 
 Info = dict[str, Tensor]
 
@@ -33,17 +35,30 @@ def critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Info
     return loss, {"loss": loss.detach(), "q": weighted_mean(q.detach(), weight)}
 
 
-def cross_entropy_critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Info]:
+def cross_entropy_critic_loss(q: Tensor, target: Tensor, weight: Tensor, floor: float = 0.0) -> tuple[Tensor, Info]:
     """Cross entropy of bounded critics (ours): the same mean as the squared TD error's, but errors of small values count.
 
     q [n, T] or [T] and target [T], both in [0, 1] [Q-value]. The gradient of the squared error at the output before the
     sigmoid is (q - target) · q · (1 - q), which vanishes far from the goal; here it is q - target. The loss is less the
     target's entropy, so that it is 0 at best.
+
+    The loss of a relative error grows with the target still: a step too many counts twenty times more near the goal than 75
+    steps from it. With a `floor` above 0 each transition counts by 1 / (target + floor), relative to their mean, and a step
+    is a step down to targets of about the floor.
     """
     target = target.expand_as(q)
     entropy = nn.functional.binary_cross_entropy(target, target, reduction="none")
-    loss = weighted_mean(nn.functional.binary_cross_entropy(q, target, reduction="none") - entropy, weight)
+    errors = nn.functional.binary_cross_entropy(q, target, reduction="none") - entropy
+    if floor > 0:
+        share = weight / (target + floor)
+        errors = errors * share * (weight.sum() / share.sum(-1, keepdim=True).clamp(min=1e-9))
+    loss = weighted_mean(errors, weight)
     return loss, {"loss": loss.detach(), "q": weighted_mean(q.detach(), weight)}
+
+
+def critic_error(kind: CriticLoss, floor: float = 0.0) -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Info]]:
+    """The loss of critics of that kind, a function of (q, target, weight); the floor is that of the cross entropy."""
+    return partial(cross_entropy_critic_loss, floor=floor) if kind == "cross_entropy" else critic_loss
 
 
 def cloning_error(action: Tensor, data_action: Tensor) -> Tensor:

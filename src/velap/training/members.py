@@ -22,8 +22,7 @@ from velap.training.capture import adam
 from velap.training.losses import (
     Info,
     cloning_error,
-    critic_loss,
-    cross_entropy_critic_loss,
+    critic_error,
     policy_loss,
     polyak,
     td_target,
@@ -58,7 +57,7 @@ class Members(nn.Module):
         }
         self.optimizers = {name: adam(parameters, config.latent_learning_rate) for name, parameters in learnt.items()}
         """By name."""
-        self.error = cross_entropy_critic_loss if config.critic_loss == "cross_entropy" else critic_loss
+        self.error = critic_error(config.critic_loss, config.critic_floor)
 
     def update(self, cache: Tensor, policies: bool, generator: torch.Generator) -> Info:
         """One update of the critics, and of the policies where it is their turn. cache [F, D]."""
