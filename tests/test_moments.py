@@ -12,10 +12,10 @@ from velap.config import ModelConfig
 from velap.data.windows import WindowSampler
 from velap.errors import ConfigError
 from velap.models.latent import LatentModel, Spaces, load_checkpoint
-from velap.models.moments import LIMIT, SLOW_LIMIT, SLOW_SCALE, ColourMoments, MomentEncoder
+from velap.models.moments import LIMIT, KEPT_LIMIT, KEPT_SCALE, ColourMoments, MomentEncoder
 from velap.training.latents import all_moments, encode_all, encode_rows
 from velap.training.loop import Trainer
-from velap.training.slow import LAG, MomentObjective, fit_palette, slow_features
+from velap.training.slow import LAG, MomentObjective, fit_palette, principal_features, slow_features
 
 SEEING = dataclasses.replace(SMALL, moment_colours=4)
 GREY, RED, BLUE = (90, 90, 90), (200, 20, 20), (20, 20, 200)
@@ -141,10 +141,21 @@ def test_a_training_with_moments_resumes_to_the_same_bits_and_is_read_again(tmp_
     assert torch.equal(read.encoder.moments.palette, second.model.encoder.moments.palette)
 
 
-SLOWLY = dataclasses.replace(SEEING, latent_dim=SEEING.latent_dim + 3, slow_features=3)
+def test_principal_features_are_the_largest_shortened_to_one_and_none_is_blown_up():
+    rng = np.random.default_rng(0)
+    turned, _ = np.linalg.qr(rng.normal(size=(4, 4)))
+    sources = rng.normal(size=(5_000, 4)) * [9.0, 3.0, 0.5, 0.01]
+    directions = principal_features(torch.from_numpy(7 + sources @ turned.T).float(), 3)
+    features = (sources @ turned.T) @ directions.double().numpy()
+    np.testing.assert_allclose(features.std(0), [1.0, 1.0, 0.5], rtol=0.05)
+    for column in range(3):
+        assert abs(np.corrcoef(features[:, column], sources[:, column])[0, 1]) > 0.99
 
 
-def test_slow_features_stand_behind_what_is_learnt_and_stay_as_they_are(tmp_path: Path):
+SLOWLY = dataclasses.replace(SEEING, latent_dim=SEEING.latent_dim + 5, slow_features=3, principal_features=2)
+
+
+def test_slow_and_principal_features_stand_behind_what_is_learnt_and_stay_as_they_are(tmp_path: Path):
     settings = config(SLOWLY, encoder_steps=3, joint_steps=2, latent_steps=1, heads_afresh=True)
     run = Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
     encoder, rows = run.model.encoder, torch.arange(len(run.sampler.frames))
@@ -153,13 +164,14 @@ def test_slow_features_stand_behind_what_is_learnt_and_stay_as_they_are(tmp_path
     run.update()
     moments = all_moments(encoder, run.sampler)
     mean, directions = slow_features(moments, run.sampler.last, 3)
-    expected = SLOW_SCALE * (moments - mean) @ directions
+    directions = torch.cat([directions, principal_features(moments, 2)], 1)
+    expected = KEPT_SCALE * (moments - mean) @ directions
     for _ in range(2):  # the joint phase and the heads from new weights change what is learnt alone
         latents = encode_all(run.model, run.sampler)
         assert latents.shape == (len(rows), SLOWLY.latent_dim)
-        torch.testing.assert_close(latents[:, -3:], expected.clamp(-SLOW_LIMIT, SLOW_LIMIT), atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(latents[:, -5:], expected.clamp(-KEPT_LIMIT, KEPT_LIMIT), atol=1e-4, rtol=1e-4)
         stacks = torch.stack([moments, moments], 1)
-        torch.testing.assert_close(encoder.from_moments(stacks)[:, :-3], encoder.learnt(stacks))
+        torch.testing.assert_close(encoder.from_moments(stacks)[:, :-5], encoder.learnt(stacks))
         while run.step < run.total:
             run.update()
 
@@ -170,9 +182,11 @@ def test_a_training_with_slow_features_resumes_to_the_same_bits(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("fields", [{"slow_features": 3}, {"moment_colours": 4, "slow_features": 32},
-                                    {"moment_colours": 1, "slow_features": 7}])
-def test_more_slow_features_than_there_can_be_are_refused(fields):
-    with pytest.raises(ConfigError, match="slow_features"):
+                                    {"moment_colours": 1, "slow_features": 7}, {"principal_features": 3},
+                                    {"moment_colours": 1, "principal_features": 7},
+                                    {"moment_colours": 4, "slow_features": 16, "principal_features": 16}])
+def test_more_features_than_there_can_be_are_refused(fields):
+    with pytest.raises(ConfigError, match="slow_features|principal_features"):
         ModelConfig(**fields)
 
 

@@ -23,10 +23,10 @@ AREA = 3.0
 """Pixels in the middle of the picture that every colour has besides its own: the centre of nothing is there [px]."""
 LIMIT = 5.0
 """Standardised moments lie within plus and minus this."""
-SLOW_SCALE = 0.8
-"""Deviation of a slow feature in the latent, about that of a learnt dimension."""
-SLOW_LIMIT = 4.0
-"""Slow features lie within plus and minus this in the latent."""
+KEPT_SCALE = 0.8
+"""Deviation of a slow feature in the latent, about that of a learnt dimension, and the largest of a principal one."""
+KEPT_LIMIT = 4.0
+"""Slow and principal features lie within plus and minus this in the latent."""
 
 
 class ColourMoments(nn.Module):
@@ -88,24 +88,24 @@ class ColourMoments(nn.Module):
 
 class MomentEncoder(nn.Module):
     """φ by colour moments: those of the newest frame and what they differ by from each older one go through the dense
-    layers of Table 2, and slow features of the newest frame's stand behind them as they are (`slow_features`);
-    uint8 `[*, N, H, W, 3] → [*, D]` (ours, `moment_colours`)."""
+    layers of Table 2, and linear features of the newest frame's stand behind them as they are (`slow_features`,
+    `principal_features`); uint8 `[*, N, H, W, 3] → [*, D]` (ours, `moment_colours`)."""
 
     def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
         super().__init__()
         self.moments = ColourMoments(config.moment_colours, size)
-        moments, learnt = 6 * config.moment_colours, config.latent_dim - config.slow_features
+        moments, learnt = 6 * config.moment_colours, config.learnt_dim
         self.dense = MLP(moments * config.frame_stack, config.encoder_dense, learnt, config.norm)
         self.final_norm = nn.LayerNorm(learnt, elementwise_affine=False) if config.latent_norm else nn.Identity()
-        self.slow_features = config.slow_features
+        self.kept = config.slow_features + config.principal_features
         """S, the last dimensions of the latent."""
-        if config.slow_features > 0:
+        if self.kept > 0:
             self.register_buffer("slow_mean", torch.zeros(moments))
-            self.register_buffer("slow_directions", torch.zeros(moments, config.slow_features))
+            self.register_buffer("slow_directions", torch.zeros(moments, self.kept))
         self.slow_mean: Tensor
         """float32 [C], mean of the moments over the data."""
         self.slow_directions: Tensor
-        """float32 [C, S], `SLOW_SCALE` deviations of a slow feature a column."""
+        """float32 [C, S], a feature a column, slow ones first."""
 
     def forward(self, frames: Tensor) -> Tensor:
         prefix, shape = frames.shape[:-4], frames.shape[-4:]
@@ -115,10 +115,10 @@ class MomentEncoder(nn.Module):
     def from_moments(self, moments: Tensor) -> Tensor:
         """Standardised moments of a stack [M, N, C] → [M, D]."""
         learnt = self.learnt(moments)
-        if self.slow_features == 0:
+        if self.kept == 0:
             return learnt
-        slow = (moments[:, -1] - self.slow_mean) @ self.slow_directions
-        return torch.cat([learnt, slow.clamp(-SLOW_LIMIT, SLOW_LIMIT)], -1)
+        kept = (moments[:, -1] - self.slow_mean) @ self.slow_directions
+        return torch.cat([learnt, kept.clamp(-KEPT_LIMIT, KEPT_LIMIT)], -1)
 
     def learnt(self, moments: Tensor) -> Tensor:
         """What the dense layers make of standardised moments of a stack: [M, N, C] → [M, D less the slow features]."""
@@ -126,8 +126,8 @@ class MomentEncoder(nn.Module):
         return self.final_norm(self.dense(torch.cat([newest, newest - moments[:, :-1]], 1).flatten(1)))
 
     @torch.no_grad()
-    def keep_slow(self, mean: Tensor, directions: Tensor) -> None:
-        """Take the slow features of moments [M, C] to be (moments - mean) @ directions: [C], [C, S], variance one."""
-        if self.slow_features > 0:
+    def keep(self, mean: Tensor, directions: Tensor) -> None:
+        """Take the features of moments [M, C] to be `KEPT_SCALE` (moments - mean) @ directions: [C], [C, S]."""
+        if self.kept > 0:
             self.slow_mean.copy_(mean)
-            self.slow_directions.copy_(SLOW_SCALE * directions[:, : self.slow_features])
+            self.slow_directions.copy_(KEPT_SCALE * directions)

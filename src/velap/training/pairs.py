@@ -65,18 +65,13 @@ class Pairs(nn.Module):
         actions = sampler.actions.shape[1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(generator.initial_seed())
-            self.inverse = MLP(2 * self.learnt_dim(model), self.HIDDEN, actions, "layer").to(sampler.device)
+            self.inverse = MLP(2 * model.config.learnt_dim, self.HIDDEN, actions, "layer").to(sampler.device)
         moved, memory = sampler.actions, model.config.command_memory
         if memory > 0:
             moved = remembered(sampler.commands(torch.arange(len(moved), device=sampler.device), memory), moved, memory)
         self.before = moved.double().cumsum(0) - moved
         """float64 [F, A], sum of all actions before each row, or of their leaky mean where the model has a memory of them:
         what lags behind its commands has gone as far as that mean says."""
-
-    @staticmethod
-    def learnt_dim(model: LatentModel) -> int:
-        """Dimensions of φ's output that the pairs teach."""
-        return model.config.latent_dim - model.config.slow_features
 
     def draw(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Rows int64 [P] of a state and of one at most `encoder_reach` steps later in the same episode."""
