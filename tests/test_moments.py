@@ -12,7 +12,7 @@ from velap.config import ModelConfig
 from velap.data.windows import WindowSampler
 from velap.errors import ConfigError
 from velap.models.latent import LatentModel, Spaces, load_checkpoint
-from velap.models.moments import LIMIT, KEPT_LIMIT, KEPT_SCALE, ColourMoments, MomentEncoder
+from velap.models.moments import KEPT_LIMIT, KEPT_SCALE, LIMIT, ColourMoments, MomentEncoder
 from velap.training.latents import all_moments, encode_all, encode_rows
 from velap.training.loop import Trainer
 from velap.training.slow import LAG, MomentObjective, fit_palette, principal_features, slow_features
@@ -186,7 +186,7 @@ def test_a_training_with_slow_features_resumes_to_the_same_bits(tmp_path: Path, 
                                     {"moment_colours": 1, "principal_features": 7},
                                     {"moment_colours": 4, "slow_features": 16, "principal_features": 16}])
 def test_more_features_than_there_can_be_are_refused(fields):
-    with pytest.raises(ConfigError, match="slow_features|principal_features"):
+    with pytest.raises(ConfigError, match=r"slow_features|principal_features"):
         ModelConfig(**fields)
 
 
