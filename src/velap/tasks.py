@@ -262,7 +262,17 @@ TASKS: dict[str, Task] = {
                 "train": {"c3": 0.5},
                 "planner": {"n_sim": 10},
             },
-            default_overrides=_SAWYER_DEFAULTS,
+            default_overrides={
+                **_MEMBERS_DEFAULTS,
+                "model": {
+                    **_MEMBERS_DEFAULTS["model"],
+                    "latent_dim": 96,
+                    "slow_features": 0,
+                    "principal_features": 64,
+                    "bank_size": 384,
+                },
+                "train": {**_MEMBERS_DEFAULTS["train"], "c3": 0.1, "critic_floor": 0.005, "member_steps": 8_000},
+            },
         ),
     )
 }
