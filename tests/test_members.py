@@ -12,6 +12,7 @@ from velap.errors import ConfigError
 from velap.models.networks import EnsembleMLP
 from velap.train_config import TrainConfig
 from velap.training.loop import Trainer
+from velap.training.losses import cross_entropy_critic_loss
 
 MANY = {"member_steps": 4, "members": 3, "distil_steps": 4, "latent_value_batch": 16}
 
@@ -72,6 +73,25 @@ def test_each_member_learns_from_its_own_critics(tmp_path):
     torch.testing.assert_close(q, one)
 
 
+def test_noise_blurs_what_members_see_and_a_floor_weighs_it(tmp_path):
+    run = trained(tmp_path, 3, member_noise=0.5, critic_loss="cross_entropy", critic_floor=0.01)
+    members = run.learner.members
+    cache, generator = run.learner.cache, run.learner.generator
+    rows = members.draw(3, generator)
+    blur = members.blur(cache, rows, generator)
+    wide = members.draw(3_000, generator)
+    spread = members.blur(cache, wide, generator).flatten(0, 1).std(0)
+    torch.testing.assert_close(spread, 0.5 * cache.std(0), rtol=0.05, atol=0)
+    losses = [members.value_loss(cache, rows, noise)[0].item() for noise in (0.0, blur)]
+    assert losses[0] != losses[1]
+    q = members.qs(members.critics, cache[rows] + blur, run.sampler.actions[rows])
+    beyond = cache[rows + 1] + blur
+    worth = members.qs(members.target, beyond, members.act(beyond)).amin(1) * run.config.train.discount
+    goal = run.sampler.rewards[rows] + (~run.sampler.terminated[rows]).float() * worth
+    expected, _ = cross_entropy_critic_loss(q, goal.detach().unsqueeze(1), torch.ones(16), 0.01)
+    assert losses[1] == pytest.approx(expected.item())
+
+
 def test_the_model_is_taught_the_members_median(tmp_path):
     run = trained(tmp_path, 6, distil_steps=300)
     members, model, cache = run.learner.members, run.model, run.learner.cache
@@ -96,8 +116,9 @@ def test_the_model_is_taught_the_members_median(tmp_path):
 
 
 @pytest.mark.parametrize("stop", [1, 4, 8])
-def test_a_training_with_members_resumes_to_the_same_bits(tmp_path, stop):
-    straight_and_resumed(tmp_path, config(SMALL, joint_steps=1, latent_steps=1, **MANY), stop)
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_a_training_with_members_resumes_to_the_same_bits(tmp_path, stop, noise):
+    straight_and_resumed(tmp_path, config(SMALL, joint_steps=1, latent_steps=1, member_noise=noise, **MANY), stop)
 
 
 @pytest.mark.parametrize("fields", [{"member_steps": 5}, {"distil_steps": 5}, {**MANY, "members": 0}])

@@ -348,6 +348,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "latent_value_batch",
         "member_steps",
         "members",
+        "member_noise",
         "distil_steps",
         "clone_steps",
         "clone_candidates",

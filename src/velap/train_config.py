@@ -144,6 +144,9 @@ class TrainConfig:
     where the data are thin, what one policy does is luck; the median of several is less so."""
     members: int = 4
     """Those policies. ours."""
+    member_noise: float = 0.0
+    """Gaussian noise on the latents that the members learn from, in deviations of each dimension. ours: φ mistakes places
+    in scenes that it has not seen."""
     distil_steps: int = 0
     """Updates that teach the members' median action and mean value to the model's π^g and Q^g [steps]. ours."""
     latent_heads: bool = True
@@ -200,6 +203,7 @@ class TrainConfig:
             require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
         require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
+        require(self.member_noise >= 0, "member_noise", self.member_noise, "0 or a positive number of deviations")
         require((self.distil_steps > 0) == (self.member_steps > 0), "distil_steps", self.distil_steps,
                 "at least 1 where `member_steps` is set, and 0 where it is not")
         require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")

@@ -57,21 +57,24 @@ class Members(nn.Module):
         }
         self.optimizers = {name: adam(parameters, config.latent_learning_rate) for name, parameters in learnt.items()}
         """By name."""
+        self.deviation: Tensor | None = None
+        """float32 [D], of the cache."""
         self.error = critic_error(config.critic_loss, config.critic_floor)
 
     def update(self, cache: Tensor, policies: bool, generator: torch.Generator) -> Info:
         """One update of the critics, and of the policies where it is their turn. cache [F, D]."""
         critics, acting = self.optimizers["member_critics"], self.optimizers["member_policies"]
         rows = self.draw(self.count, generator)
+        blur = self.blur(cache, rows, generator)
         critics.zero_grad(set_to_none=True)
-        loss, info = self.value_loss(cache, rows)
+        loss, info = self.value_loss(cache, rows, blur)
         loss.backward()
         critics.step()
         polyak(list(self.target.parameters()), list(self.critics.parameters()), self.config.target_rate)
         if not policies:
             return info
         acting.zero_grad(set_to_none=True)
-        loss, more = self.acting_loss(cache, rows)
+        loss, more = self.acting_loss(cache, rows, blur)
         loss.backward(inputs=list(self.policies.parameters()))
         acting.step()
         return {**info, **more}
@@ -91,6 +94,16 @@ class Members(nn.Module):
         return pool[torch.randint(len(pool), (members, self.config.latent_value_batch), generator=generator,
                                   device=pool.device)]
 
+    def blur(self, cache: Tensor, rows: Tensor, generator: torch.Generator) -> Tensor | float:
+        """Noise of `member_noise` deviations of each dimension [E, B, D], the same in both states of a transition: what φ
+        mistakes about a place it mistakes a step later too. rows int64 [E, B]."""
+        if self.config.member_noise == 0:
+            return 0.0
+        if self.deviation is None:
+            self.deviation = cache.std(0)
+        noise = torch.randn(*rows.shape, cache.shape[1], generator=generator, device=cache.device)
+        return self.config.member_noise * self.deviation * noise
+
     def act(self, latents: Tensor) -> Tensor:
         """Each member's action: [E, B, D] → [E, B, A] in [-1, 1]."""
         return torch.tanh(self.policies.each(latents))
@@ -100,19 +113,19 @@ class Members(nn.Module):
         joined = torch.cat([latents, actions], -1).repeat_interleave(self.n_global, 0)
         return self.bound(critics.each(joined).squeeze(-1)).view(self.count, self.n_global, -1)
 
-    def value_loss(self, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
-        """Eq. 4 of every member. cache [F, D], rows int64 [E, B]."""
+    def value_loss(self, cache: Tensor, rows: Tensor, blur: Tensor | float = 0.0) -> tuple[Tensor, Info]:
+        """Eq. 4 of every member. cache [F, D], rows int64 [E, B], blur [E, B, D]."""
         sampler, weight = self.sampler, torch.ones(rows.shape[1], device=rows.device)
         with torch.no_grad():
-            then = cache[rows + 1]
+            then = cache[rows + 1] + blur
             next_q = self.qs(self.target, then, self.act(then)).amin(1)
             goal = td_target(sampler.rewards[rows], (~sampler.terminated[rows]).float(), next_q, self.config.discount)
-        loss, info = self.error(self.qs(self.critics, cache[rows], sampler.actions[rows]), goal.unsqueeze(1), weight)
+        loss, info = self.error(self.qs(self.critics, cache[rows] + blur, sampler.actions[rows]), goal.unsqueeze(1), weight)
         return loss, {"members/loss": info["loss"], "members/q": info["q"]}
 
-    def acting_loss(self, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
-        """Eq. 5 of every member. cache [F, D], rows int64 [E, B]."""
-        latents = cache[rows]
+    def acting_loss(self, cache: Tensor, rows: Tensor, blur: Tensor | float = 0.0) -> tuple[Tensor, Info]:
+        """Eq. 5 of every member. cache [F, D], rows int64 [E, B], blur [E, B, D]."""
+        latents = cache[rows] + blur
         action = self.act(latents)
         q = self.qs(self.critics, latents, action).amin(1)
         weight = torch.ones(rows.shape[1], device=rows.device)
