@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from velap.config import ModelConfig
+from velap.config import Config, ModelConfig
 from velap.errors import VelapError
-from velap.models.latent import LatentModel, Spaces
+from velap.models.latent import LatentModel, Spaces, load_checkpoint, save_checkpoint
 
 SMALL = ModelConfig(
     frame_stack=2,
@@ -113,3 +113,22 @@ def test_encode_takes_any_prefix_and_reads_every_frame_of_the_stack():
     changed = frames.clone()
     changed[..., 0, :, :, :] = 0
     assert (model.encode(changed) - latents).abs().max() > 1e-4
+
+
+def test_half_weights_halve_the_checkpoint_and_are_read_into_single_precision(tmp_path):
+    sizes, read = {}, {}
+    for half in (False, True):
+        model = make_model(half_weights=half, policy_dense=(128, 128))
+        config = Config("SpiralMaze", "default", model=model.config)
+        digest = save_checkpoint(tmp_path / "model.safetensors", model, config, {})
+        sizes[half] = (tmp_path / "model.safetensors").stat().st_size
+        read[half], again, _ = load_checkpoint(tmp_path / "model.safetensors")
+        assert again == config
+        # what was rounded stays as it is
+        assert save_checkpoint(tmp_path / "again.safetensors", read[half], config, {}) == digest
+    assert sizes[True] < 0.6 * sizes[False]
+    for (name, exact), rounded in zip(read[False].state_dict().items(), read[True].state_dict().values(), strict=True):
+        assert rounded.dtype == exact.dtype
+        rough = 1e-3 if exact.dtype == torch.float32 and exact.dim() > 1 else 0.0
+        torch.testing.assert_close(rounded, exact, rtol=rough, atol=1e-3 * rough, msg=name)
+    assert not torch.equal(read[True].dynamics.state_dict()["0.weight"], read[False].dynamics.state_dict()["0.weight"])

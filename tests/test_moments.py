@@ -15,7 +15,7 @@ from velap.models.latent import LatentModel, Spaces, load_checkpoint
 from velap.models.moments import KEPT_LIMIT, KEPT_SCALE, LIMIT, ColourMoments, MomentEncoder
 from velap.training.latents import all_moments, encode_all, encode_rows
 from velap.training.loop import Trainer
-from velap.training.slow import LAG, MomentObjective, fit_palette, principal_features, slow_features
+from velap.training.slow import LAG, MomentObjective, fit_palette, slow_features
 
 SEEING = dataclasses.replace(SMALL, moment_colours=4)
 GREY, RED, BLUE = (90, 90, 90), (200, 20, 20), (20, 20, 200)
@@ -141,22 +141,12 @@ def test_a_training_with_moments_resumes_to_the_same_bits_and_is_read_again(tmp_
     assert torch.equal(read.encoder.moments.palette, second.model.encoder.moments.palette)
 
 
-def test_principal_features_are_the_largest_shortened_to_one_and_none_is_blown_up():
-    rng = np.random.default_rng(0)
-    turned, _ = np.linalg.qr(rng.normal(size=(4, 4)))
-    sources = rng.normal(size=(5_000, 4)) * [9.0, 3.0, 0.5, 0.01]
-    directions = principal_features(torch.from_numpy(7 + sources @ turned.T).float(), 3)
-    features = (sources @ turned.T) @ directions.double().numpy()
-    np.testing.assert_allclose(features.std(0), [1.0, 1.0, 0.5], rtol=0.05)
-    for column in range(3):
-        assert abs(np.corrcoef(features[:, column], sources[:, column])[0, 1]) > 0.99
+SLOWLY = dataclasses.replace(SEEING, latent_dim=SEEING.latent_dim + 3, slow_features=3)
+WHOLLY = dataclasses.replace(SLOWLY, latent_dim=SLOWLY.latent_dim + 6 * SLOWLY.moment_colours, keep_moments=True)
 
 
-SLOWLY = dataclasses.replace(SEEING, latent_dim=SEEING.latent_dim + 5, slow_features=3, principal_features=2)
-
-
-def test_slow_and_principal_features_stand_behind_what_is_learnt_and_stay_as_they_are(tmp_path: Path):
-    settings = config(SLOWLY, encoder_steps=3, joint_steps=2, latent_steps=1, heads_afresh=True)
+def test_slow_features_and_moments_stand_behind_what_is_learnt_and_stay_as_they_are(tmp_path: Path):
+    settings = config(WHOLLY, encoder_steps=3, joint_steps=2, latent_steps=1, heads_afresh=True)
     run = Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
     encoder, rows = run.model.encoder, torch.arange(len(run.sampler.frames))
     assert isinstance(encoder, MomentEncoder)
@@ -164,14 +154,16 @@ def test_slow_and_principal_features_stand_behind_what_is_learnt_and_stay_as_the
     run.update()
     moments = all_moments(encoder, run.sampler)
     mean, directions = slow_features(moments, run.sampler.last, 3)
-    directions = torch.cat([directions, principal_features(moments, 2)], 1)
-    expected = KEPT_SCALE * (moments - mean) @ directions
+    slow = (KEPT_SCALE * (moments - mean) @ directions).clamp(-KEPT_LIMIT, KEPT_LIMIT)
+    expected = torch.cat([slow, KEPT_SCALE * moments], 1)
+    kept = expected.shape[1]
+    assert kept == 3 + 24
     for _ in range(2):  # the joint phase and the heads from new weights change what is learnt alone
         latents = encode_all(run.model, run.sampler)
-        assert latents.shape == (len(rows), SLOWLY.latent_dim)
-        torch.testing.assert_close(latents[:, -5:], expected.clamp(-KEPT_LIMIT, KEPT_LIMIT), atol=1e-4, rtol=1e-4)
+        assert latents.shape == (len(rows), WHOLLY.latent_dim)
+        torch.testing.assert_close(latents[:, -kept:], expected, atol=1e-4, rtol=1e-4)
         stacks = torch.stack([moments, moments], 1)
-        torch.testing.assert_close(encoder.from_moments(stacks)[:, :-5], encoder.learnt(stacks))
+        torch.testing.assert_close(encoder.from_moments(stacks)[:, :-kept], encoder.learnt(stacks))
         while run.step < run.total:
             run.update()
 
@@ -182,11 +174,11 @@ def test_a_training_with_slow_features_resumes_to_the_same_bits(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("fields", [{"slow_features": 3}, {"moment_colours": 4, "slow_features": 32},
-                                    {"moment_colours": 1, "slow_features": 7}, {"principal_features": 3},
-                                    {"moment_colours": 1, "principal_features": 7},
-                                    {"moment_colours": 4, "slow_features": 16, "principal_features": 16}])
+                                    {"moment_colours": 1, "slow_features": 7}, {"keep_moments": True},
+                                    {"moment_colours": 4, "latent_dim": 24, "keep_moments": True},
+                                    {"moment_colours": 4, "latent_dim": 40, "slow_features": 16, "keep_moments": True}])
 def test_more_features_than_there_can_be_are_refused(fields):
-    with pytest.raises(ConfigError, match=r"slow_features|principal_features"):
+    with pytest.raises(ConfigError, match=r"slow_features|keep_moments|latent_dim"):
         ModelConfig(**fields)
 
 

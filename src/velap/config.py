@@ -36,9 +36,9 @@ class ModelConfig:
     slow_features: int = 0
     """The last so many of φ's units are the slowest linear features of the moments, as they are. ours: dense layers lose a
     third of what moments tell of where a window is (`docs/decisions.md`)."""
-    principal_features: int = 0
-    """And so many behind those are the moments' principal components. ours: a task of many objects asks for most of what
-    the moments tell (`docs/decisions.md`)."""
+    keep_moments: bool = False
+    """Behind those stand all moments of the newest frame, which `latent_dim` counts too. ours: a task of many objects asks
+    for all that they tell (`docs/decisions.md`)."""
     encoder_filters: tuple[int, ...] = (32, 32, 64, 64)
     """Table 2."""
     encoder_kernels: tuple[int, ...] = (4, 4, 4, 4)
@@ -76,6 +76,8 @@ class ModelConfig:
     """What that mean is multiplied by [latent distance]. ours."""
     command_dims: int = 0
     """So many actions are remembered, the first ones; 0 remembers all. ours: a gripper that no task needs is noise."""
+    half_weights: bool = False
+    """Weight matrices are in half precision in the checkpoint, which they halve; computing is in single. ours."""
     bank_size: int = 4096
     """Dataset latents kept with the model for support tests and film strips; 0 keeps none. ours; 0 in `paper`."""
 
@@ -83,10 +85,14 @@ class ModelConfig:
         require(1 <= self.frame_stack <= 16, "frame_stack", self.frame_stack, "1 to 16 frames")
         require(0 <= self.moment_colours <= 256, "moment_colours", self.moment_colours, "0 to 256 colours")
         require(self.latent_dim >= 1, "latent_dim", self.latent_dim, "a positive number of units")
-        for name, other in (("slow_features", self.principal_features), ("principal_features", self.slow_features)):
-            most = max(min(self.latent_dim - 1 - other, 6 * self.moment_colours), 0)
-            require(0 <= getattr(self, name) <= most, name, getattr(self, name),
-                    f"0 to {most}: both less than latent_dim, and no more than there are moments (6 × moment_colours)")
+        require(not self.keep_moments or self.moment_colours > 0, "keep_moments", True,
+                "False where `moment_colours` is 0: there are no moments")
+        moments = 6 * self.moment_colours
+        most = max(min(self.latent_dim - 1 - self.keep_moments * moments, moments), 0)
+        require(0 <= self.slow_features <= most, "slow_features", self.slow_features,
+                f"0 to {most}: less than latent_dim, and no more than there are moments (6 × moment_colours)")
+        require(self.learnt_dim >= 1, "latent_dim", self.latent_dim,
+                f"more than {moments}: `keep_moments` puts 6 × moment_colours of them behind what is learnt")
         require(self.norm in get_args(Norm), "norm", self.norm, f"one of {get_args(Norm)}")
         sizes = {len(self.encoder_filters), len(self.encoder_kernels), len(self.encoder_strides)}
         require(len(sizes) == 1, "encoder_filters", self.encoder_filters, "as many filters as kernels and strides")
@@ -101,7 +107,7 @@ class ModelConfig:
     @property
     def learnt_dim(self) -> int:
         """Units of φ that come out of its dense layers."""
-        return self.latent_dim - self.slow_features - self.principal_features
+        return self.latent_dim - self.slow_features - self.keep_moments * 6 * self.moment_colours
 
     def width(self, action_dim: int) -> int:
         """D, dimensions of a latent with all that is in it."""
@@ -246,10 +252,10 @@ class Config:
             "'mse' where `critic_bounded` is off: cross entropy asks for Q-values in [0, 1]",
         )
         require(
-            self.model.learnt_dim == self.model.latent_dim or self.train.encoder_steps > 0,
+            self.model.slow_features == 0 or self.train.encoder_steps > 0,
             "encoder_steps",
             self.train.encoder_steps,
-            "at least 1 where `slow_features` or `principal_features` is set: the encoder phase finds them",
+            "at least 1 where `slow_features` is set: the encoder phase finds them",
         )
         for name, steps in (("clone_steps", self.train.clone_steps), ("success_rollout", self.controller.success_rollout)):
             require(self.model.success_policy or steps == 0, name, steps, "0 where `success_policy` is off")
@@ -329,7 +335,7 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
 
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
     "model": ("success_policy", "command_memory", "command_scale", "command_dims", "moment_colours",
-              "slow_features", "principal_features"),
+              "slow_features", "keep_moments", "half_weights"),
     "train": (
         "encoder_steps",
         "encoder_pairs",

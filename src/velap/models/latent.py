@@ -274,6 +274,9 @@ def shared_weights(metadata: Mapping[str, str]) -> str:
 def save_checkpoint(path: Path, model: LatentModel, config: Config, provenance: Mapping[str, str]) -> str:
     """One safetensors file with weights, config and provenance (command, seed, dataset hash); returns its SHA-256."""
     weights = model.state_dict()
+    if config.model.half_weights:
+        weights = {name: value.half() if value.dtype == torch.float32 and value.dim() > 1 else value
+                   for name, value in weights.items()}
     shared = {name: value for name, value in weights.items() if not name.startswith(OWN_WEIGHTS)}
     metadata = {
         **provenance,

@@ -24,9 +24,9 @@ AREA = 3.0
 LIMIT = 5.0
 """Standardised moments lie within plus and minus this."""
 KEPT_SCALE = 0.8
-"""Deviation of a slow feature in the latent, about that of a learnt dimension, and the largest of a principal one."""
+"""Deviation of a slow feature or a moment in the latent, about that of a learnt dimension."""
 KEPT_LIMIT = 4.0
-"""Slow and principal features lie within plus and minus this in the latent."""
+"""Slow features lie within plus and minus this in the latent, and moments too."""
 
 
 class ColourMoments(nn.Module):
@@ -88,8 +88,8 @@ class ColourMoments(nn.Module):
 
 class MomentEncoder(nn.Module):
     """φ by colour moments: those of the newest frame and what they differ by from each older one go through the dense
-    layers of Table 2, and linear features of the newest frame's stand behind them as they are (`slow_features`,
-    `principal_features`); uint8 `[*, N, H, W, 3] → [*, D]` (ours, `moment_colours`)."""
+    layers of Table 2, and slow features of the newest frame's (`slow_features`) or all of those (`keep_moments`) stand
+    behind them as they are; uint8 `[*, N, H, W, 3] → [*, D]` (ours, `moment_colours`)."""
 
     def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
         super().__init__()
@@ -97,15 +97,15 @@ class MomentEncoder(nn.Module):
         moments, learnt = 6 * config.moment_colours, config.learnt_dim
         self.dense = MLP(moments * config.frame_stack, config.encoder_dense, learnt, config.norm)
         self.final_norm = nn.LayerNorm(learnt, elementwise_affine=False) if config.latent_norm else nn.Identity()
-        self.kept = config.slow_features + config.principal_features
-        """S, the last dimensions of the latent."""
-        if self.kept > 0:
+        self.slow_features, self.keep_moments = config.slow_features, config.keep_moments
+        """S, dimensions of the latent behind those that are learnt, and whether the moments stand behind these."""
+        if config.slow_features > 0:
             self.register_buffer("slow_mean", torch.zeros(moments))
-            self.register_buffer("slow_directions", torch.zeros(moments, self.kept))
+            self.register_buffer("slow_directions", torch.zeros(moments, config.slow_features))
         self.slow_mean: Tensor
         """float32 [C], mean of the moments over the data."""
         self.slow_directions: Tensor
-        """float32 [C, S], a feature a column, slow ones first."""
+        """float32 [C, S], `KEPT_SCALE` deviations of a slow feature a column."""
 
     def forward(self, frames: Tensor) -> Tensor:
         prefix, shape = frames.shape[:-4], frames.shape[-4:]
@@ -114,20 +114,21 @@ class MomentEncoder(nn.Module):
 
     def from_moments(self, moments: Tensor) -> Tensor:
         """Standardised moments of a stack [M, N, C] → [M, D]."""
-        learnt = self.learnt(moments)
-        if self.kept == 0:
-            return learnt
-        kept = (moments[:, -1] - self.slow_mean) @ self.slow_directions
-        return torch.cat([learnt, kept.clamp(-KEPT_LIMIT, KEPT_LIMIT)], -1)
+        parts, newest = [self.learnt(moments)], moments[:, -1]
+        if self.slow_features > 0:
+            parts.append(((newest - self.slow_mean) @ self.slow_directions).clamp(-KEPT_LIMIT, KEPT_LIMIT))
+        if self.keep_moments:
+            parts.append(KEPT_SCALE * newest)
+        return torch.cat(parts, -1)
 
     def learnt(self, moments: Tensor) -> Tensor:
-        """What the dense layers make of standardised moments of a stack: [M, N, C] → [M, D less the slow features]."""
+        """What the dense layers make of standardised moments of a stack: [M, N, C] → [M, D less what is kept]."""
         newest = moments[:, -1:]
         return self.final_norm(self.dense(torch.cat([newest, newest - moments[:, :-1]], 1).flatten(1)))
 
     @torch.no_grad()
-    def keep(self, mean: Tensor, directions: Tensor) -> None:
-        """Take the features of moments [M, C] to be `KEPT_SCALE` (moments - mean) @ directions: [C], [C, S]."""
-        if self.kept > 0:
+    def keep_slow(self, mean: Tensor, directions: Tensor) -> None:
+        """Take the slow features of moments [M, C] to be (moments - mean) @ directions: [C], [C, S], variance one."""
+        if self.slow_features > 0:
             self.slow_mean.copy_(mean)
-            self.slow_directions.copy_(KEPT_SCALE * directions)
+            self.slow_directions.copy_(KEPT_SCALE * directions[:, : self.slow_features])

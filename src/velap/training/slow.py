@@ -63,15 +63,6 @@ def slow_features(moments: Tensor, last: Tensor, count: int = SLOW) -> tuple[Ten
     return mean, directions / (centred @ directions).std(0).clamp(min=1e-6)
 
 
-def principal_features(moments: Tensor, count: int) -> Tensor:
-    """Directions [C, count] of the principal components of moments [F, C], the largest first; those whose deviation is more
-    than one are shortened to one, so that an arm does not drown the rest, and none is blown up."""
-    centred = moments - moments.mean(0)
-    _, found = np.linalg.eigh((centred.T @ centred / len(centred)).double().cpu().numpy())
-    directions = torch.from_numpy(found[:, ::-1][:, :count].copy()).to(moments)
-    return directions / (centred @ directions).square().mean(0).sqrt().clamp(min=1.0)
-
-
 class MomentObjective(Pairs):
     """Multi-step inverse dynamics, the moments of the newest frame, and the slow features of it: their means over the
     episode, which hold no accident of the moment, and the rest. Moments of all frames are measured once."""
@@ -99,9 +90,7 @@ class MomentObjective(Pairs):
         sampler = self.sampler
         measured = all_moments(model.encoder, sampler)
         middle, directions = slow_features(measured, sampler.last, self.slow)
-        shape = model.config
-        kept = [directions[:, : shape.slow_features], principal_features(measured, shape.principal_features)]
-        model.encoder.keep(middle, torch.cat(kept, 1))
+        model.encoder.keep_slow(middle, directions)
         features = (measured - middle) @ directions
         numbers = torch.unique(sampler.first, return_inverse=True)[1]
         sums = torch.zeros(int(numbers.max()) + 1, self.slow, device=sampler.device).index_add_(0, numbers, features)
