@@ -260,7 +260,8 @@ def test_pairs_lie_in_one_training_episode_and_know_their_actions(tmp_path):
 
 def test_the_critics_loss_and_the_policies_gain_are_those_of_the_config(tmp_path):
     runs = {name: trainer(tmp_path / name, **changes) for name, changes in {
-        "plain": {}, "entropy": {"critic_loss": "cross_entropy"}, "relative": {"policy_relative": True}}.items()}
+        "plain": {}, "entropy": {"critic_loss": "cross_entropy"}, "relative": {"policy_relative": True},
+        "floor": {"critic_loss": "cross_entropy", "critic_floor": 0.01}}.items()}
     infos = {}
     for name, run in runs.items():
         batch = run.sampler.sample(8, 3, True, torch.Generator().manual_seed(0))
@@ -270,6 +271,8 @@ def test_the_critics_loss_and_the_policies_gain_are_those_of_the_config(tmp_path
     for loss in ("local/loss", "global/loss"):
         assert entropy[loss] > 1.5 * plain[loss], "at least twice the squared error, by Pinsker's inequality"
         assert torch.equal(relative[loss], plain[loss])
+    assert torch.equal(infos["floor"]["local/loss"], entropy["local/loss"]), "the floor is that of the global critics"
+    assert not torch.isclose(infos["floor"]["global/loss"], entropy["global/loss"], rtol=0.01)
     weight = runs["relative"].config.train.c3
     assert relative["global/policy"].item() == pytest.approx(-1 + weight * relative["global/imitation"].item(), abs=1e-5)
 

@@ -262,6 +262,7 @@ TASKS: dict[str, Task] = {
                 "train": {"c3": 0.5},
                 "planner": {"n_sim": 10},
             },
+            # two subtasks: all that the moments tell, less imitation, and critics that know a step far from the goal
             default_overrides={
                 **_MEMBERS_DEFAULTS,
                 "model": {

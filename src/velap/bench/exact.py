@@ -145,9 +145,10 @@ def learn(data: States, config: Config, seed: int, view: View | None = None) -> 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         # the true state holds the speed of the hand, and there is no picture to measure
-        blind = dataclasses.replace(config.model, command_memory=0.0, moment_colours=0, slow_features=0)
+        blind = dataclasses.replace(config.model, latent_dim=config.model.learnt_dim, command_memory=0.0, moment_colours=0,
+                                    slow_features=0, keep_moments=False)
         model = LatentModel(blind, spaces, train.discount, train.precision).train()
-    model.encode = ExactEncoder(data, config.model.latent_dim)  # type: ignore[method-assign]
+    model.encode = ExactEncoder(data, blind.latent_dim)  # type: ignore[method-assign]
     learner = JointLearner(model, train, sampler, make_generator(seed, stream=1, device=device))
     learner.begin_latent_phase()
     done = 0
