@@ -102,10 +102,23 @@ def test_ctrl_c_exits_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 def test_settings_take_the_type_of_their_field() -> None:
     settings = ["planner.n_iter=500", "train.c1=1", "planner.anchor=snap", "planner.discard_low_exponent=20.0"]
-    assert cli.parse_settings(settings) == {
+    assert cli.parse_settings([settings]) == {
         "planner": {"n_iter": 500, "anchor": "snap", "discard_low_exponent": 20.0}, "train": {"c1": 1.0}}
     with pytest.raises(ConfigError, match=r"2\.5 for planner.n_iter; expected int, such as 250"):
-        cli.parse_settings(["planner.n_iter=2.5"])
+        cli.parse_settings([["planner.n_iter=2.5"]])
+
+
+def test_every_set_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """argparse keeps the values of the last one alone unless it is told to append."""
+    seen: list[Any] = []
+
+    def taken(settings: cli.Settings = ()) -> None:
+        seen.append(cli.parse_settings(settings))
+
+    monkeypatch.setitem(cli.COMMANDS, "info", taken)
+    assert cli.main(["info", "--set", "train.c1=1", "train.c3=2", "--set", "planner.n_sim=3"]) == 0
+    assert cli.main(["info"]) == 0
+    assert seen == [{"train": {"c1": 1.0, "c3": 2.0}, "planner": {"n_sim": 3}}, {}]
 
 
 def test_an_evaluation_goes_on_where_it_stopped(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,12 +7,13 @@ import shlex
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from velap.config import Config
 from velap.errors import ConfigError, VelapError
@@ -27,7 +28,9 @@ Method = Annotated[
     arg(help="VELAP, a baseline of Table 1 (`td3bc` is π^g alone, `iql-sparse` is IQL as its authors set it for sparse "
              "rewards), or uniform actions.")]
 Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="`auto` takes CUDA where there is one.")]
-Settings = Annotated[tuple[str, ...], arg(name="set", help="Config fields to replace, such as `planner.n_iter=500`.")]
+Settings = Annotated[tuple[tuple[str, ...], ...], UseAppendAction,
+                     arg(name="set", help="Config fields to replace, such as `planner.n_iter=500`.")]
+"""One tuple for each `--set` of the command line."""
 Records = Annotated[Path, arg(help="Root of the episode records.")]
 
 
@@ -84,7 +87,7 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
 
 
 def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str | None, device: str, resume: bool,
-           settings: Sequence[str], method: str = "velap") -> Path:
+           settings: Sequence[Sequence[str]], method: str = "velap") -> Path:
     """Train with a progress bar; returns the joint checkpoint."""
     from velap import api
     from velap.bench.console import TrainView
@@ -354,14 +357,15 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 PARTS = ("model", "train", "planner", "controller")
 
 
-def parse_settings(settings: Sequence[str], further: Mapping[str, object] | None = None) -> dict[str, dict[str, Any]]:
-    """`["planner.n_iter=500"]` -> `{"planner": {"n_iter": 500}}`; raises ConfigError on any other form.
+def parse_settings(settings: Sequence[Sequence[str]], further: Mapping[str, object] | None = None,
+                   ) -> dict[str, dict[str, Any]]:
+    """`[["planner.n_iter=500"]]` -> `{"planner": {"n_iter": 500}}`; raises ConfigError on any other form.
 
     `further` parts beside those of the config, such as a method's own settings, with their defaults.
     """
     parts = {**{part: getattr(Config(task="", preset=""), part) for part in PARTS}, **(further or {})}
     changes: dict[str, dict[str, Any]] = {}
-    for setting in settings:
+    for setting in chain.from_iterable(settings):
         name, equals, text = setting.partition("=")
         part, dot, field = name.partition(".")
         if not (equals and dot and part in parts):
