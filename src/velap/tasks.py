@@ -149,6 +149,28 @@ _MEMBERS_DEFAULTS: dict[str, dict[str, Any]] = {
 """ours: slow features tell where things stand, and π^g is the median of five that imitate more and learn no longer than they
 gain by it. It leads; the tree takes over where the hand is stuck, which a high price of revisits says soon."""
 
+_ALL_MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
+    **_MEMBERS_DEFAULTS,
+    "model": {
+        **_MEMBERS_DEFAULTS["model"],
+        "latent_dim": 176,
+        "slow_features": 0,
+        "keep_moments": True,
+        "half_weights": True,
+    },
+    "train": {
+        **_MEMBERS_DEFAULTS["train"],
+        "c3": 0.2,
+        "critic_floor": 0.005,
+        "member_steps": 8_000,
+        "members": 4,
+        "member_noise": 0.15,
+    },
+    "controller": {**_MEMBERS_DEFAULTS["controller"], "stop_exponent": 250.0},
+}
+"""ours: the latent keeps all moments, values far from the goal count as much as near ones, and noise on the latents keeps π^g
+from learning single ones. The tree is the last resort: h errs by most of a step in latents that carry the moments' noise."""
+
 TASKS: dict[str, Task] = {
     task.name: task
     for task in (
@@ -244,13 +266,7 @@ TASKS: dict[str, Task] = {
                 "planner": {"n_iter": 500, "n_sim": 10},
                 "controller": {"n_replan": 25},
             },
-            default_overrides={
-                **_MOMENTS_DEFAULTS,
-                "model": {**_MOMENTS_DEFAULTS["model"], "success_policy": False},
-                "train": {**_MOMENTS_DEFAULTS["train"], "clone_steps": 0},
-                "planner": {**_SAWYER_DEFAULTS["planner"], "rehearsals": 4},
-                "controller": {**_MOMENTS_DEFAULTS["controller"], "n_replan": 12, "success_rollout": 0},
-            },
+            default_overrides=_ALL_MOMENTS_DEFAULTS,
         ),
         Task(
             name="DrawerButton",
@@ -264,23 +280,8 @@ TASKS: dict[str, Task] = {
             },
             # two subtasks: all that the moments tell, less imitation, and critics that know a step far from the goal
             default_overrides={
-                **_MEMBERS_DEFAULTS,
-                "model": {
-                    **_MEMBERS_DEFAULTS["model"],
-                    "latent_dim": 176,
-                    "slow_features": 0,
-                    "keep_moments": True,
-                    "half_weights": True,
-                },
-                "train": {
-                    **_MEMBERS_DEFAULTS["train"],
-                    "c3": 0.1,
-                    "critic_floor": 0.005,
-                    "member_steps": 8_000,
-                    "members": 4,
-                    "member_noise": 0.15,
-                },
-                "controller": {**_MEMBERS_DEFAULTS["controller"], "stop_exponent": 250.0},
+                **_ALL_MOMENTS_DEFAULTS,
+                "train": {**_ALL_MOMENTS_DEFAULTS["train"], "c3": 0.1},
             },
         ),
     )
