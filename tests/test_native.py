@@ -59,6 +59,18 @@ def test_half_precision_stays_close_and_keeps_the_first_layer(norm, inputs, hidd
         assert not torch.equal(run(x), exact)
 
 
+@pytest.mark.skipif(native.library() is None or not native.library().velap_tiles(), reason="no matrix tiles here")
+@torch.no_grad()
+@pytest.mark.parametrize(("inputs", "outputs"), [(1, 1), (40, 33), (183, 128)])
+@pytest.mark.parametrize("rows", [1, 32, 75])
+def test_the_first_layer_of_tiles_keeps_16_bits(inputs, outputs, rows):
+    network, x = stirred(MLP(inputs, (), outputs, "none")), torch.randn(rows, inputs) + 10
+    found = native.native_network(fold(dense_layers(network)), refuse, half=True)(x)
+    size = torch.nn.functional.linear(x.abs(), network[0].weight.abs(), network[0].bias.abs())
+    error = ((found - network(x)).abs() / size).max()
+    assert 0 < error < 2**-15  # one bfloat16 number: about 2**-9
+
+
 @needs_compiler
 @torch.no_grad()
 @pytest.mark.parametrize("norm", ["layer", "batch", "none"])
@@ -76,10 +88,11 @@ def test_inputs_lie_side_by_side_and_members_come_first(norm):
 @torch.no_grad()
 def test_a_row_does_not_depend_on_the_rows_beside_it():
     network = stirred(MLP(12, (64, 64), 5, "layer"))
-    run, x = native.native_network(fold(dense_layers(network)), refuse), torch.randn(37, 12)
-    alone = torch.cat([run(row[None]) for row in x])
-    assert torch.equal(run(x), alone)
-    assert torch.equal(run(x[5:30]), alone[5:30])
+    for half in (False, native.library().velap_halves() == 1):
+        run, x = native.native_network(fold(dense_layers(network)), refuse, half), torch.randn(37, 12)
+        alone = torch.cat([run(row[None]) for row in x])
+        assert torch.equal(run(x), alone)
+        assert torch.equal(run(x[5:30]), alone[5:30])
 
 
 @needs_compiler

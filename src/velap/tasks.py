@@ -168,8 +168,8 @@ _ALL_MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "controller": {**_MEMBERS_DEFAULTS["controller"], "stop_exponent": 250.0},
 }
-"""ours: the latent keeps all moments, values far from the goal count as much as near ones, and noise on the latents keeps π^g
-from learning single ones. The tree is the last resort: h errs by most of a step in latents that carry the moments' noise."""
+"""ours: the latent keeps all moments, values far from the goal count as much as near ones, and noise on the latents keeps
+π^g from learning single ones. The tree is the last resort: h errs by most of a step in latents with the moments' noise."""
 
 TASKS: dict[str, Task] = {
     task.name: task

@@ -27,6 +27,10 @@ from velap.storage import replace_file
 
 PANEL = 32
 """Columns of a weight panel, as in native.c."""
+TILE_INPUTS = 32
+"""Inputs are padded to a multiple of this in bfloat16, as in native.c."""
+MOST_TILED = 1024
+"""Units of a layer up to which tiles are used: a block of 32 rows has to fit on the stack. ours."""
 MOST_ROWS = 2048
 """Rows of a call up to which one thread of native.c is at least as fast as PyTorch on two cores. ours."""
 MOST_UNITS = 4096
@@ -39,7 +43,8 @@ class _Layer(ctypes.Structure):
     """`Layer` of native.c."""
 
     _fields_ = (("inputs", ctypes.c_long), ("outputs", ctypes.c_long), ("weights", ctypes.c_void_p),
-                ("bias", ctypes.c_void_p), ("shift", ctypes.c_void_p), ("halves", ctypes.c_void_p))
+                ("bias", ctypes.c_void_p), ("shift", ctypes.c_void_p), ("halves", ctypes.c_void_p),
+                ("lows", ctypes.c_void_p))
 
 
 @cache
@@ -84,7 +89,8 @@ def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
     found.velap_rollout.argtypes = [address, number, address, number, address, address, number, number, number, ctypes.c_int,
                                     number, number, ctypes.c_float, ctypes.c_float, address]
     found.velap_network.restype = found.velap_rollout.restype = None
-    found.velap_halves.argtypes, found.velap_halves.restype = [], ctypes.c_int
+    for question in (found.velap_halves, found.velap_tiles):
+        question.argtypes, question.restype = [], ctypes.c_int
     return found
 
 
@@ -106,7 +112,8 @@ def _width(layers: Sequence[Folded]) -> int:
 def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor], half: bool = False) -> Callable[..., Tensor]:
     """Inputs `[*, W_1], [*, W_2], ...`, taken side by side, → `[n, *, V]` of the members, or `[*, V]` of weights [W, V].
 
-    `half` multiplies in bfloat16 in all layers but the first, which keeps the precision of the latents.
+    `half` multiplies in bfloat16 in all layers but the first, which keeps the precision of the latents (16 bits of it with
+    matrix tiles, AMX).
 
     `otherwise` gets what native.c cannot take (other devices and types, more rows than pay) and must give the same. The
     weights are copied.
@@ -116,8 +123,8 @@ def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor], h
         return otherwise
     single = layers[0].weight.dim() == 2
     members = 1 if single else len(layers[0].weight)
-    kept, structs = _pack(layers, members, half)
     width = _width(layers)
+    kept, structs = _pack(layers, members, half, tiled=half and width <= MOST_TILED and bool(found.velap_tiles()))
     outputs, inputs = layers[-1].weight.shape[-1], layers[0].weight.shape[-2]
     run, fixed = found.velap_network, (ctypes.addressof(structs), members, len(layers))
 
@@ -150,7 +157,7 @@ def native_rollout(
     found = _library_for([*acting, *moving])
     if found is None:
         return None
-    kept = [_pack(layers, 1, False) for layers in (acting, moving)]
+    kept = [_pack(layers, 1) for layers in (acting, moving)]
     run, width = found.velap_rollout, max(_width(acting), _width(moving))
     fixed = [number for _, structs in kept for number in (ctypes.addressof(structs), len(structs))]
 
@@ -168,8 +175,12 @@ def native_rollout(
 
 
 @torch.no_grad()
-def _pack(layers: Sequence[Folded], members: int, half: bool) -> tuple[list[Tensor], ctypes.Array[_Layer]]:
-    """Weights in panels, and the structs that point to them, member by member."""
+def _pack(layers: Sequence[Folded], members: int, half: bool = False,
+          tiled: bool = False) -> tuple[list[Tensor], ctypes.Array[_Layer]]:
+    """Weights in panels, and the structs that point to them, member by member.
+
+    `half`: all but the first in bfloat16 as well; `tiled`: that too, and what bfloat16 leaves of its weights.
+    """
     kept: list[Tensor] = []
     structs = (_Layer * (members * len(layers)))()
     for index, layer in enumerate(layers):
@@ -184,13 +195,18 @@ def _pack(layers: Sequence[Folded], members: int, half: bool) -> tuple[list[Tens
             if part is not None:
                 vectors[-1][:, :outputs] = part.reshape(members, outputs)
         kept += [panels, *vectors]
-        if half and index > 0:
-            pairs = torch.cat([panels, panels.new_zeros(members, padded // PANEL, inputs % 2, PANEL)], 2)
-            pairs = pairs.unflatten(2, (-1, 2)).transpose(3, 4).to(torch.bfloat16).contiguous()
-            kept.append(pairs)
+        halves = _halves(panels) if half and (index > 0 or tiled) else None
+        lows = _halves(panels - panels.bfloat16()) if halves is not None and index == 0 else None
+        kept += [part for part in (halves, lows) if part is not None]
+        parts = (panels, vectors[0], vectors[1] if layer.shift is not None else None, halves, lows)
         for member in range(members):
-            shift = vectors[1][member].data_ptr() if layer.shift is not None else None
-            structs[member * len(layers) + index] = _Layer(inputs, outputs, panels[member].data_ptr(),
-                                                           vectors[0][member].data_ptr(), shift,
-                                                           pairs[member].data_ptr() if half and index > 0 else None)
+            addresses = [None if part is None else part[member].data_ptr() for part in parts]
+            structs[member * len(layers) + index] = _Layer(inputs, outputs, *addresses)
     return kept, structs
+
+
+def _halves(panels: Tensor) -> Tensor:
+    """Panels [members, P, W, PANEL] in bfloat16 by pairs of inputs, [members, P, W / 2, PANEL, 2], W padded with zeros."""
+    members, count, inputs, columns = panels.shape
+    padding = panels.new_zeros(members, count, -inputs % TILE_INPUTS, columns)
+    return torch.cat([panels, padding], 2).unflatten(2, (-1, 2)).transpose(3, 4).to(torch.bfloat16).contiguous()
