@@ -20,10 +20,12 @@ from velap import cli
 from velap.bench import demo
 from velap.bench.diagnose_failures import CLASSES, REMEDIES, Trace, classify, judge, watch
 from velap.bench.diagnose_model import (
+    LED,
     Album,
     Pairs,
     Recorded,
     ValueCurve,
+    action_values,
     album_of,
     encode_states,
     other_pairs,
@@ -125,6 +127,49 @@ def test_aliasing_counts_states_that_are_truly_apart() -> None:
     assert pairs.aliased(3.0) == pytest.approx(2 / 3)
     assert pairs.aliased(30.0) is None
     assert dataclasses.replace(pairs, least_steps=None).aliased(3.0) is None
+
+
+class ClimbingModel(LineModel):
+    """The goal is 255 places up the line and π^g goes there at once; farther than `sight` Q^g is blind to actions."""
+
+    sight = 1e9
+
+    def value(self, latent: Tensor) -> Tensor:
+        return DISCOUNT ** (255 - latent[..., 0])
+
+    def global_q(self, latent: Tensor, action: Tensor) -> Tensor:
+        seen = 255 - latent[..., 0] <= self.sight
+        return self.value(latent) * DISCOUNT ** torch.where(seen, 1 - action[..., 0], latent[..., 0] % 7)
+
+
+def test_promises_of_actions_are_compared_with_what_comes_of_them() -> None:
+    rng = np.random.default_rng(0)
+    walks = [np.repeat(rng.choice([-1, 1], 40), LED) for _ in range(4)]
+    places = [100 + np.concatenate([[0], walk.cumsum()]) for walk in walks]
+    rows = sum(map(len, places))
+    frames = np.broadcast_to(np.concatenate(places).astype(np.uint8)[:, None, None, None], (rows, 4, 4, 3)).copy()
+    ends = np.cumsum([len(place) for place in places]) - 1
+    truncated = np.isin(np.arange(rows), ends - 1)
+    rewards, never = np.zeros(rows), np.zeros(rows, bool)
+    actions = np.concatenate([[*walk, 0] for walk in walks])[:, None].astype(float)
+    store = make_store(frames, actions, rewards, never, truncated, np.array([len(walk) for walk in walks]),
+                       np.array([-1.0]), np.array([1.0]), "test/walks-v0")
+    sampler = WindowSampler(store, TrainConfig(), 1, torch.device("cpu"), np.arange(3))
+    recorded = Recorded(store, sampler, np.arange(3), True, None)
+    model: Any = ClimbingModel()
+    latents = encode_states(model, recorded.sampler, recorded.rows)
+    found = action_values(model, recorded, latents)
+    assert len(found.away) == sum(len(place) - LED for place in places[:3])
+    taken = np.concatenate([walk[: len(walk) + 1 - LED] for walk in walks[:3]])
+    np.testing.assert_allclose(found.promised, taken - 1, atol=1e-3)
+    np.testing.assert_allclose(found.gained, np.concatenate([place[LED:] - place[:-LED] for place in places[:3]]), atol=1e-2)
+    assert min(found.rho(far=False), found.rho(far=True)) > 0.7
+    model.sight = np.median(found.away)
+    blind = action_values(model, recorded, latents)
+    assert blind.rho(far=False) > 0.7
+    assert abs(blind.rho(far=True)) < 0.25
+    assert np.isnan(dataclasses.replace(blind, away=blind.away[:60], promised=blind.promised[:60], gained=blind.gained[:60])
+                    .rho(far=True)), "30 transitions are too few"
 
 
 def test_rank_correlation_and_values_along_an_episode() -> None:

@@ -16,11 +16,13 @@ from velap.bench import diagnose_figures as figures
 from velap.bench.demo import released_checkpoint
 from velap.bench.diagnose_failures import Failures, watch
 from velap.bench.diagnose_model import (
+    ActionValues,
     Album,
     Pairs,
     Recorded,
     RolloutError,
     ValueCurve,
+    action_values,
     album_of,
     encode_states,
     open_recorded,
@@ -98,6 +100,7 @@ class Diagnosis:
     rollout: RolloutError
     pairs: tuple[Pairs, ...]
     curves: tuple[ValueCurve, ...]
+    actions: ActionValues
     scenes: tuple[Scene, ...]
     trees: Trees
     failures: Failures | None
@@ -198,7 +201,8 @@ def _measure(console: Console, request: Request, subject: _Subject, model: Laten
     return Diagnosis(
         subject.name, request.command, _origin(subject, recorded, config), _left_out(world, player),
         model.discount, config.controller.waypoint_exponent, config.planner.n_sim, rollout, tuple(pairs), curves,
-        world.scenes, trees, failures, (*pictures, *(["failure.png"] if failures is not None else [])))
+        action_values(model, recorded, held_out), world.scenes, trees, failures,
+        (*pictures, *(["failure.png"] if failures is not None else [])))
 
 
 class _World(NamedTuple):

@@ -36,6 +36,11 @@ REWARDED = 3
 """Rewarded episodes that Q^g is drawn along. ours."""
 LAST = 20
 """Steps before the reward over which Q^g has to rise; farther away it may be flat, a tree searches there [steps]. ours."""
+LED = 5
+"""The value of an action is compared with that of the state so many steps later [steps]. ours: recorded actions last some
+steps, and one step is hardly more than the noise of a value."""
+FEWEST = 50
+"""Transitions that a correlation is taken over at least. ours."""
 APART = 2.0
 """Two states are apart where the agent needs more than this times the steps that count as arrived. ours."""
 
@@ -240,6 +245,41 @@ def rewarded_curves(model: LatentModel, recorded: Recorded, count: int = REWARDE
         rows = np.arange(first, first + int(store.episode_length[episode]) + 1)
         curves.append(value_curve(model, f"episode {episode} of the data", encode_states(model, recorded.sampler, rows)))
     return curves
+
+
+@dataclass(frozen=True)
+class ActionValues:
+    """What Q^g promises of recorded actions, against what has come of them some steps later; S transitions.
+
+    π^g climbs Q^g over actions, so this tells whether it can know where to go; values along episodes do not, as they may be
+    right at states and blind to actions.
+    """
+
+    away: NDArray[np.float64]
+    """[S] log_γ Q^g(z, π^g(z)) before the action [steps]."""
+    promised: NDArray[np.float64]
+    """[S] steps that the recorded action is better than π^g's by Q^g [steps]."""
+    gained: NDArray[np.float64]
+    """[S] steps that Q^g sees the goal come nearer over the next `LED` [steps]."""
+
+    def rho(self, far: bool) -> float:
+        """Spearman's rho of promise and gain over the farther or the nearer half; NaN where there are too few."""
+        half = (self.away > np.median(self.away)) == far if len(self.away) else np.zeros(0, bool)
+        if half.sum() < FEWEST:
+            return float("nan")
+        return rank_correlation(self.promised[half], self.gained[half])
+
+
+@torch.inference_mode()
+def action_values(model: LatentModel, recorded: Recorded, latents: Tensor) -> ActionValues:
+    """Judge the recorded actions of the episodes that are looked at; latents [R, D] of `recorded.rows`."""
+    actions = recorded.sampler.actions[torch.from_numpy(recorded.rows).to(recorded.sampler.device)]
+    values, taken = (steps_from_q(q, model.discount).double().cpu().numpy()
+                     for q in (model.value(latents), model.global_q(latents, actions)))
+    lengths = [last - first + 1 for first, last in recorded.spans]
+    begins = np.cumsum([0, *lengths[:-1]])
+    now = np.concatenate([begin + np.arange(max(length - LED, 0)) for begin, length in zip(begins, lengths, strict=True)])
+    return ActionValues(values[now], values[now] - taken[now], values[now] - values[now + LED])
 
 
 @dataclass(frozen=True)

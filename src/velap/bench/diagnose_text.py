@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from velap.bench.diagnose_failures import CLASSES, REMEDIES, Failures
-from velap.bench.diagnose_model import APART, LAST, Pairs, RolloutError, ValueCurve
+from velap.bench.diagnose_model import APART, LAST, LED, ActionValues, Pairs, RolloutError, ValueCurve
 from velap.bench.diagnose_plans import TreeNumbers, Trees
 from velap.bench.diagnose_world import NEAR, Scene
 from velap.models.horizon import steps_from_q
@@ -30,6 +30,8 @@ ALIASED = 0.05
 """Share of states apart that Q^l may call the same."""
 RHO = 0.7
 """Spearman's rho of learnt and true distances."""
+ACTION_RHO = 0.4
+"""Spearman's rho of what Q^g promises of an action and what comes of it."""
 GAIN = 10.0
 """Steps by Q^g that a plan comes nearer to a goal that it does not find."""
 SUPPORT_FACTOR = 1.5
@@ -59,6 +61,7 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     found = [*_of_rollouts(diagnosis.rollout, diagnosis.simulated), *_of_pairs(diagnosis.pairs, limit)]
     found += _of_scenes(diagnosis.scenes, limit) if diagnosis.scenes else []
     found += [_of_curves(diagnosis.curves)] if diagnosis.curves else []
+    found.append(_of_actions(diagnosis.actions))
     found += _of_trees(diagnosis.trees, diagnosis.discount)
     return found + ([_of_failures(diagnosis.failures)] if diagnosis.failures is not None else [])
 
@@ -120,6 +123,19 @@ def _of_curves(curves: Sequence[ValueCurve]) -> Finding:
         min(ends) >= 0.5 and min(rhos) >= RHO,
         f"near 1 at the rewarded action, rho of {RHO} and more; far from the goal Q^g may flatten, the tree searches there",
         "low at the end: too few rewards seen, raise train.rewarded_share or add successes; flat: train longer")
+
+
+def _of_actions(actions: ActionValues) -> Finding:
+    """Q^g of actions against where they lead."""
+    rhos = [actions.rho(far) for far in (False, True)]
+    return Finding(
+        "Q^g of recorded actions against what comes of them", f"rho {_numbers(rhos)} in the nearer and the farther half of "
+        f"{len(actions.away)} transitions (Q^g {LED} steps later)",
+        None if any(math.isnan(rho) for rho in rhos) else min(rhos) >= ACTION_RHO,
+        f"{ACTION_RHO} and more in both; below it π^g, which climbs Q^g over actions, cannot know where to go although "
+        "values along episodes are right",
+        "low in the farther half: the critics see steps near the goal alone, train.critic_floor; low in the nearer half: "
+        "more rewarded data, or train.c3 for more imitation")
 
 
 def _of_trees(trees: Trees, discount: float) -> Iterator[Finding]:
