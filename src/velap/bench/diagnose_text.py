@@ -30,8 +30,8 @@ ALIASED = 0.05
 """Share of states apart that Q^l may call the same."""
 RHO = 0.7
 """Spearman's rho of learnt and true distances."""
-ACTION_RHO = 0.4
-"""Spearman's rho of what Q^g promises of an action and what comes of it."""
+ACTION_RHO = 0.3
+"""Spearman's rho of what Q^g promises of an action and what comes of it; 0.4 to 0.75 where a task is solved."""
 GAIN = 10.0
 """Steps by Q^g that a plan comes nearer to a goal that it does not find."""
 SUPPORT_FACTOR = 1.5
@@ -132,8 +132,8 @@ def _of_actions(actions: ActionValues) -> Finding:
         "Q^g of recorded actions against what comes of them", f"rho {_numbers(rhos)} in the nearer and the farther half of "
         f"{len(actions.away)} transitions (Q^g {LED} steps later)",
         None if any(math.isnan(rho) for rho in rhos) else min(rhos) >= ACTION_RHO,
-        f"{ACTION_RHO} and more in both; below it π^g, which climbs Q^g over actions, cannot know where to go although "
-        "values along episodes are right",
+        f"{ACTION_RHO} and more in both, 0.4 to 0.75 on our own tasks; π^g climbs Q^g over actions, so of two models the one "
+        "with the lower rho knows less where to go, however right its values along episodes are",
         "low in the farther half: the critics see steps near the goal alone, train.critic_floor; low in the nearer half: "
         "more rewarded data, or train.c3 for more imitation")
 
