@@ -132,8 +132,8 @@ def _of_actions(actions: ActionValues) -> Finding:
         "Q^g of recorded actions against what comes of them", f"rho {_numbers(rhos)} in the nearer and the farther half of "
         f"{len(actions.away)} transitions (Q^g {LED} steps later)",
         None if any(math.isnan(rho) for rho in rhos) else min(rhos) >= ACTION_RHO,
-        f"{ACTION_RHO} and more in both, 0.4 to 0.75 on our own tasks; π^g climbs Q^g over actions, so of two models the one "
-        "with the lower rho knows less where to go, however right its values along episodes are",
+        f"{ACTION_RHO} and more in both, 0.4 to 0.75 on our own tasks; π^g climbs Q^g over actions, so of two models the "
+        "one with the lower rho knows less where to go, however right its values along episodes are",
         "low in the farther half: the critics see steps near the goal alone, train.critic_floor; low in the nearer half: "
         "more rewarded data, or train.c3 for more imitation")
 
