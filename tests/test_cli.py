@@ -14,6 +14,7 @@ import torch
 import velap
 from velap import cli
 from velap.bench.records import read_records
+from velap.bench.settings import parse_settings
 from velap.config import override
 from velap.errors import ConfigError
 from velap.models.latent import LatentModel, Spaces, save_checkpoint
@@ -102,10 +103,10 @@ def test_ctrl_c_exits_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 def test_settings_take_the_type_of_their_field() -> None:
     settings = ["planner.n_iter=500", "train.c1=1", "planner.anchor=snap", "planner.discard_low_exponent=20.0"]
-    assert cli.parse_settings([settings]) == {
+    assert parse_settings([settings]) == {
         "planner": {"n_iter": 500, "anchor": "snap", "discard_low_exponent": 20.0}, "train": {"c1": 1.0}}
     with pytest.raises(ConfigError, match=r"2\.5 for planner.n_iter; expected int, such as 250"):
-        cli.parse_settings([["planner.n_iter=2.5"]])
+        parse_settings([["planner.n_iter=2.5"]])
 
 
 def test_every_set_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,7 +114,7 @@ def test_every_set_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Any] = []
 
     def taken(settings: cli.Settings = ()) -> None:
-        seen.append(cli.parse_settings(settings))
+        seen.append(parse_settings(settings))
 
     monkeypatch.setitem(cli.COMMANDS, "info", taken)
     assert cli.main(["info", "--set", "train.c1=1", "train.c3=2", "--set", "planner.n_sim=3"]) == 0

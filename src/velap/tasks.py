@@ -115,9 +115,17 @@ counts, the latent phase learns the rest, and a policy is cloned from the succes
 goal π^g, which has seen experts there, takes over, and wherever the cloned policy gets to the goal by the model, that one. A
 smaller bank keeps the checkpoint below 3 MB."""
 
-_MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
+_MEMBERS_DEFAULTS: dict[str, dict[str, Any]] = {
     **_SAWYER_DEFAULTS,
-    "model": {**_SAWYER_DEFAULTS["model"], "moment_colours": 24, "command_memory": 0.7, "command_dims": 3},
+    "model": {
+        **_SAWYER_DEFAULTS["model"],
+        "success_policy": False,
+        "latent_dim": 64,
+        "slow_features": 32,
+        "moment_colours": 24,
+        "command_memory": 0.7,
+        "command_dims": 3,
+    },
     "train": {
         **_SAWYER_DEFAULTS["train"],
         "encoder_steps": 8_000,
@@ -125,28 +133,22 @@ _MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
         "inverse": 1.0,
         "joint_steps": 0,
         "heads_afresh": True,
-        "latent_value_steps": 8_000,
-    },
-    "controller": {**_SAWYER_DEFAULTS["controller"], "stop_exponent": 150.0},
-}
-"""ours: places come from colour moments, the hand's speed from the past actions, and all else is learnt on frozen latents.
-π^g is good on those, and leads wherever Q^g sees the goal within 150 steps; the tree leads from farther away."""
-
-_MEMBERS_DEFAULTS: dict[str, dict[str, Any]] = {
-    **_MOMENTS_DEFAULTS,
-    "model": {**_MOMENTS_DEFAULTS["model"], "success_policy": False, "latent_dim": 64, "slow_features": 32},
-    "train": {
-        **_MOMENTS_DEFAULTS["train"],
         "clone_steps": 0,
         "c3": 1.0,
-        "latent_value_steps": 0,
         "member_steps": 5_000,
         "members": 5,
         "distil_steps": 3_000,
     },
-    "controller": {**_MOMENTS_DEFAULTS["controller"], "success_rollout": 0, "goal_lookahead": 0, "revisit_penalty": 8.0},
+    "controller": {
+        **_SAWYER_DEFAULTS["controller"],
+        "stop_exponent": 150.0,
+        "success_rollout": 0,
+        "goal_lookahead": 0,
+        "revisit_penalty": 8.0,
+    },
 }
-"""ours: slow features tell where things stand, and π^g is the median of five that imitate more and learn no longer than they
+"""ours: places come from colour moments, of which slow features tell where things stand, the hand's speed from the past
+actions, and all else is learnt on frozen latents. π^g is the median of five that imitate more and learn no longer than they
 gain by it. It leads; the tree takes over where the hand is stuck, which a high price of revisits says soon."""
 
 _ALL_MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
@@ -278,7 +280,7 @@ TASKS: dict[str, Task] = {
                 "train": {"c3": 0.5},
                 "planner": {"n_sim": 10},
             },
-            # two subtasks: all that the moments tell, less imitation, and critics that know a step far from the goal
+            # two subtasks: less imitation
             default_overrides={
                 **_ALL_MOMENTS_DEFAULTS,
                 "train": {**_ALL_MOMENTS_DEFAULTS["train"], "c3": 0.1},
