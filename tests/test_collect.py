@@ -1,6 +1,7 @@
 """Collection: the same arrays whatever the workers, kills that cost little, errors with a way out, and the card."""
 
 import dataclasses
+import errno
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from PIL import Image
 
 from velap.data import behaviours, cards, collect, minari_io
 from velap.data.episodes import FrameStore, load_positions, load_store
+from velap.data.pool import Worker
 from velap.errors import DatasetError, RenderError, StorageError, UnknownTaskError
 from velap.tasks import Recipe, Task
 
@@ -290,6 +292,21 @@ def test_a_full_disk_keeps_what_is_finished(root: Path):
         assert run.stderr.strip().splitlines()[-1].startswith("velap.errors.StorageError: could not write")
         assert not (root / "velap" / "Line-v0").exists()
     assert collect.collect(TASK, seed=3, workers=1).resumed == 24
+
+
+def test_what_killed_workers_were_writing_is_deleted(root: Path, monkeypatch: pytest.MonkeyPatch):
+    shards = root / "velap" / ".Line-v0.partial" / "shards"
+
+    def one_fails(running: list[Worker], *_: object) -> None:
+        running[1].ask(kind="shard", name="00000-000000.npz", context=0, first=0, count=10)
+        running[1].answer()
+        (shards / ".00000-000010.npz.tmp").write_bytes(b"half a shard")
+        raise OSError(errno.EFBIG, "File too large")
+
+    monkeypatch.setattr(collect, "run_all", one_fails)
+    with pytest.raises(StorageError, match="File too large"):
+        collect.collect(TASK, seed=3, workers=2)
+    assert [path.name for path in shards.iterdir()] == ["00000-000000.npz"]
 
 
 # the card

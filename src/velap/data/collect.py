@@ -132,9 +132,14 @@ def _prepare(work: Path, plan: dict[str, Any], resume: bool) -> tuple[str, ...]:
         shutil.rmtree(shards, ignore_errors=True)
         replace_file(work / PLAN_FILE, json.dumps(plan, sort_keys=True).encode())
     shards.mkdir(exist_ok=True)
+    _sweep(shards)
+    return tuple(notes)
+
+
+def _sweep(shards: Path) -> None:
+    """Delete what workers that were killed while they wrote left behind; none may be writing."""
     for leftover in shards.glob(".*.tmp"):
         leftover.unlink(missing_ok=True)
-    return tuple(notes)
 
 
 def _forget_finished(work: Path, dataset_id: str) -> None:
@@ -196,17 +201,20 @@ def _collect(task: Task, seed: int, count: int, dataset_id: str, resume: bool, p
     began, work, shards = time.monotonic(), minari_io.partial_path(dataset_id), _shards(task)
     recipe, shares = dataclasses.asdict(task.recipe), mixture(task.name)
     job = {"env_id": task.env_id, "recipe": recipe, "shares": shares, "seed": seed, "shards": str(work / "shards")}
-    with workers(count, job, work) as running:
-        description = _describe(running, task.env_id)
-        plan = {"task": task.name, "env_id": task.env_id, "seed": seed, "recipe": recipe, "shares": shares,
-                "fingerprint": description["fingerprint"]}
-        notes = _prepare(work, plan, resume)
-        pending = [shard for shard in shards if not _finished(work / "shards" / shard.name, shard)]
-        total = sum(shard.count for shard in shards)
-        resumed = total - sum(shard.count for shard in pending)
-        run_all(running, [{"kind": "shard", **dataclasses.asdict(shard)} for shard in pending], resumed, total, progress)
-        running[0].ask(kind="test_starts")
-        starts = running[0].answer()["test_starts"]
+    try:
+        with workers(count, job, work) as running:
+            description = _describe(running, task.env_id)
+            plan = {"task": task.name, "env_id": task.env_id, "seed": seed, "recipe": recipe, "shares": shares,
+                    "fingerprint": description["fingerprint"]}
+            notes = _prepare(work, plan, resume)
+            pending = [shard for shard in shards if not _finished(work / "shards" / shard.name, shard)]
+            total = sum(shard.count for shard in shards)
+            resumed = total - sum(shard.count for shard in pending)
+            run_all(running, [{"kind": "shard", **dataclasses.asdict(shard)} for shard in pending], resumed, total, progress)
+            running[0].ask(kind="test_starts")
+            starts = running[0].answer()["test_starts"]
+    finally:
+        _sweep(work / "shards")  # an error of one worker ends the others in the middle of their files
     provenance = {"plan": plan, "command": command, "test_starts": starts, "extent": description["extent"]}
     store, path, card = _build(task, plan, work, description, provenance, dataset_id)
     return CollectResult(dataset_id, path, store.content_hash, store.n_episodes, store.n_transitions,
