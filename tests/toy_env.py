@@ -79,6 +79,7 @@ class ToyModel(nn.Module):
         super().__init__()
         self.anchor = nn.Parameter(torch.zeros(1, dtype=torch.float64))
         self._fns = toy_fns(**changes)
+        self.held_policy = None
         self.encoded_batches: list[int] = []
 
     action_dim, config = 2, ModelConfig()

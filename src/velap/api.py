@@ -60,7 +60,7 @@ def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwr
 
 def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Path | None = None, *,
           method: str = "velap", image_key: str | None = None, device: str = "auto", resume: bool = False,
-          changes: Changes | None = None, command: str = "velap.train",
+          changes: Changes | None = None, base: Path | None = None, command: str = "velap.train",
           on_progress: Callable[[Progress], None] = lambda progress: None) -> Path:
     """Train on a task's dataset, or on any Minari dataset with images and a sparse reward; returns the joint checkpoint.
 
@@ -77,6 +77,7 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         device: `auto`, `cpu` or `cuda`.
         resume: go on with the joint run in `out`; a finished one is left as it is. Heads always go on.
         changes: config fields to replace; under `head` those of the method's learner.
+        base: a finished checkpoint of the same config, seed and data, of which only VELAP's own policies are learnt anew.
         command: kept in the checkpoint as its origin.
         on_progress: called after every logged step.
     """
@@ -98,7 +99,8 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
     if method != "velap" and checkpoint.exists():
         _check_origin(checkpoint, task, preset, seed, changes)
     elif not (resume and _is_finished(checkpoint, config, seed, store.content_hash)):
-        run(config, store, directory, seed=seed, device=device, resume=resume, command=command, on_progress=on_progress)
+        run(config, store, directory, seed=seed, device=device, resume=resume, base=base, command=command,
+            on_progress=on_progress)
     if learner is not None:
         train_head(method, checkpoint, store, config=learner, device=device, command=command, on_progress=on_progress)
     return checkpoint

@@ -59,7 +59,7 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
 
 def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: str | None = None,
           preset: Preset = "default", seed: int = 0, out: Path | None = None, device: Device = "auto", resume: bool = False,
-          settings: Settings = (), method: Method = "velap") -> None:
+          settings: Settings = (), method: Method = "velap", base: Path | None = None) -> None:
     """Train on a task's dataset or on any Minari dataset with images and a sparse reward.
 
     All methods share the joint training; it is done first where its checkpoint is missing. BC, IQL and IRIS then learn on
@@ -72,6 +72,8 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
         seed: Decides weights and batches.
         out: Run directory; runs/TASK/PRESET/seedSEED unless said.
         resume: Go on with the unfinished run in the run directory.
+        base: Finished checkpoint of the same task, preset, seed and data: only the policies that VELAP alone acts by are
+            learnt anew.
     """
     if (task is None) == (dataset is None):
         raise ConfigError(f"got the task {task!r} and the dataset {dataset!r}; expected one of them: `velap train TASK` or "
@@ -80,12 +82,12 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
         from velap.tasks import get_task
 
         get_task(task)
-    checkpoint = _train(str(task or dataset), preset, seed, out, image_key, device, resume, settings, method)
+    checkpoint = _train(str(task or dataset), preset, seed, out, image_key, device, resume, settings, method, base)
     OUT.print(f"checkpoint {checkpoint}", markup=False)
 
 
 def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str | None, device: str, resume: bool,
-           settings: Sequence[Sequence[str]], method: str = "velap") -> Path:
+           settings: Sequence[Sequence[str]], method: str = "velap", base: Path | None = None) -> Path:
     """Train with a progress bar; returns the joint checkpoint."""
     from velap import api
     from velap.bench.console import TrainView
@@ -101,7 +103,7 @@ def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str
     view = TrainView(OUT)
     try:
         checkpoint = api.train(source, preset, seed, out, method=method, image_key=image_key, device=device, resume=resume,
-                               changes=changes, command=_command(), on_progress=view)
+                               changes=changes, base=base, command=_command(), on_progress=view)
     finally:
         view.close()
     if learns:

@@ -67,6 +67,9 @@ class ModelConfig:
     """Members of the global critic, of which the minimum counts (TD3's two). ours; 1 in `paper`: Eq. 4 has no minimum."""
     success_policy: bool = False
     """A policy cloned from successful episodes beside π^g, as BC(D*) of D.1 but in the model. ours; off in `paper`."""
+    held_policy: bool = False
+    """A policy learnt from actions held for several steps (`held_steps`), which leads VELAP in place of π^g. ours; off in
+    `paper`."""
     latent_norm: bool = False
     """Latents are normalised to zero mean and unit variance over their dimensions. ours; off in `paper`."""
     command_memory: float = 0.0
@@ -217,6 +220,9 @@ class ControllerConfig:
     """At every step the policy cloned from successes (`success_policy`) is simulated this far; where it gets to a node with
     Q^g above τ_goal, it acts and nothing is planned; 0 has none [steps]. ours: errors of h that a search exploits, a policy
     that knows nothing of h hardly meets."""
+    success_exponent: float = 0.0
+    """The policy cloned from successes acts where Q^g, less what revisits cost, is above γ^this; 0 has none [steps]. ours:
+    the last steps to a success ask for more than Q^g tells, and what worked is in the data."""
     revisit_penalty: float = 0.0
     """Every state that the episode has been in moves the goal away from its surroundings by this [steps]; 0 trusts Q^g.
     ours: plans and π^g then leave places that promise the goal and do not keep it."""
@@ -227,6 +233,8 @@ class ControllerConfig:
         require(self.shortcut_exponent >= 0, "shortcut_exponent", self.shortcut_exponent, "0 or more")
         require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
         require(self.success_rollout >= 0, "success_rollout", self.success_rollout, "0 or more steps")
+        require(0 <= self.success_exponent <= self.stop_exponent, "success_exponent", self.success_exponent,
+                "0 to `stop_exponent` steps")
         require(self.goal_lookahead >= 0, "goal_lookahead", self.goal_lookahead, "0 or more steps")
         require(self.lookahead_gain >= 1, "lookahead_gain", self.lookahead_gain, "a factor of 1 or more")
         require(self.revisit_penalty >= 0, "revisit_penalty", self.revisit_penalty, "0 or more steps")
@@ -257,8 +265,12 @@ class Config:
             self.train.encoder_steps,
             "at least 1 where `slow_features` is set: the encoder phase finds them",
         )
-        for name, steps in (("clone_steps", self.train.clone_steps), ("success_rollout", self.controller.success_rollout)):
+        asked = {"clone_steps": self.train.clone_steps, "success_rollout": self.controller.success_rollout,
+                 "success_exponent": self.controller.success_exponent}
+        for name, steps in asked.items():
             require(self.model.success_policy or steps == 0, name, steps, "0 where `success_policy` is off")
+        require(self.model.held_policy or self.train.held_steps == 0, "held_steps", self.train.held_steps,
+                "0 where `held_policy` is off")
 
     def to_json(self) -> str:
         """Canonical JSON: sorted keys, so that equal configs are equal text.
@@ -274,8 +286,7 @@ class Config:
     def shared_json(self) -> str:
         """Canonical JSON of what all methods share: without planner, controller, the policy of successes and the bank."""
         raw = json.loads(self.to_json())
-        for part, name in (("model", "success_policy"), ("model", "bank_size"), ("train", "clone_steps"),
-                           ("train", "clone_candidates")):
+        for part, name in OWN_FIELDS:
             raw[part].pop(name, None)
         return json.dumps({name: raw[name] for name in ("task", "preset", "model", "train")}, sort_keys=True)
 
@@ -333,8 +344,14 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
     return dataclasses.replace(config, **parts)
 
 
+OWN_FIELDS = (
+    ("model", "success_policy"), ("model", "held_policy"), ("model", "bank_size"), ("train", "clone_steps"),
+    ("train", "clone_candidates"), ("train", "clone_reach"), ("train", "held_steps"), ("train", "held_actions"),
+    ("train", "held_members"),
+)
+"""Fields by part that matter to VELAP alone, besides planner and controller."""
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "model": ("success_policy", "command_memory", "command_scale", "command_dims", "moment_colours",
+    "model": ("success_policy", "held_policy", "command_memory", "command_scale", "command_dims", "moment_colours",
               "slow_features", "keep_moments", "half_weights"),
     "train": (
         "encoder_steps",
@@ -358,6 +375,10 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "distil_steps",
         "clone_steps",
         "clone_candidates",
+        "clone_reach",
+        "held_steps",
+        "held_actions",
+        "held_members",
         "critic_loss",
         "critic_floor",
         "policy_relative",
@@ -371,7 +392,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
     ),
     "planner": ("rehearsals", "rehearsal_paths", "rehearsal_noise"),
     "controller": ("residuals", "shortcut_exponent", "lookahead_gain", "goal_lookahead", "revisit_penalty",
-                   "success_rollout"),
+                   "success_rollout", "success_exponent"),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 

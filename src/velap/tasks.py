@@ -280,10 +280,19 @@ TASKS: dict[str, Task] = {
                 "train": {"c3": 0.5},
                 "planner": {"n_sim": 10},
             },
-            # two subtasks: less imitation
+            # two subtasks: less imitation; far from the goal held actions, near it what has worked
             default_overrides={
                 **_ALL_MOMENTS_DEFAULTS,
-                "train": {**_ALL_MOMENTS_DEFAULTS["train"], "c3": 0.1},
+                "model": {**_ALL_MOMENTS_DEFAULTS["model"], "held_policy": True, "success_policy": True},
+                "train": {
+                    **_ALL_MOMENTS_DEFAULTS["train"],
+                    "c3": 0.1,
+                    "held_steps": 8_000,
+                    "clone_steps": 3_000,
+                    "clone_candidates": 1,
+                    "clone_reach": 25,
+                },
+                "controller": {**_ALL_MOMENTS_DEFAULTS["controller"], "success_exponent": 30.0},
             },
         ),
     )

@@ -149,6 +149,14 @@ class TrainConfig:
     in scenes that it has not seen."""
     distil_steps: int = 0
     """Updates that teach the members' median action and mean value to the model's π^g and Q^g [steps]. ours."""
+    held_steps: int = 0
+    """Updates of members whose transitions are of `held_actions` steps, for the policy of `held_policy`, which then learns
+    their median for `distil_steps`; 0 has none [steps]. ours: which way to go a hundred steps from the goal is easier to
+    tell by several steps than by one."""
+    held_actions: int = 5
+    """Steps of those transitions; their action is the mean of as many [steps]. ours."""
+    held_members: int = 4
+    """Those members. ours."""
     latent_heads: bool = True
     """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
     clone_steps: int = 0
@@ -158,6 +166,9 @@ class TrainConfig:
     """Policies that share those updates, one after the other from weights of their own; the one is kept that gets to the
     goal most often by h and Q^g from far states of the data. ours: where a clone goes from states unlike the successes is
     luck."""
+    clone_reach: int = 0
+    """Only the last so many steps before a success are cloned; 0 clones all of a successful episode [steps]. ours: the way
+    there is a random walk's as often as an expert's, its end is what worked."""
     holdout_episodes: int = 16
     """Unrewarded episodes kept out of training for the diagnostics. ours."""
     latent_learning_rate: float = 1e-3
@@ -173,7 +184,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         later = ("latent_steps", "latent_dynamics_steps", "latent_value_steps", "member_steps", "distil_steps",
-                 "clone_steps")
+                 "held_steps", "clone_steps", "clone_reach")
         for name in ("encoder_steps", "joint_steps", *later, "value_transitions", "dynamics_rollouts"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in (
@@ -191,6 +202,7 @@ class TrainConfig:
             "latent_dynamics_horizon",
             "latent_value_batch",
             "members",
+            "held_members",
             "clone_candidates",
             "log_every",
             "diagnose_every",
@@ -204,8 +216,10 @@ class TrainConfig:
         require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
         require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
         require(self.member_noise >= 0, "member_noise", self.member_noise, "0 or a positive number of deviations")
-        require((self.distil_steps > 0) == (self.member_steps > 0), "distil_steps", self.distil_steps,
-                "at least 1 where `member_steps` is set, and 0 where it is not")
+        taught = self.member_steps > 0 or self.held_steps > 0
+        require((self.distil_steps > 0) == taught, "distil_steps", self.distil_steps,
+                "at least 1 where `member_steps` or `held_steps` is set, and 0 where neither is")
+        require(self.held_actions >= 2, "held_actions", self.held_actions, "at least 2 steps")
         require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
         require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
         for name in ("rewarded_share", "latent_rewarded_share", "encoder_rewarded_share"):
@@ -257,6 +271,8 @@ class TrainConfig:
             ("dynamics", self.latent_dynamics_steps),
             ("values", self.latent_value_steps),
             ("members", self.member_steps),
-            ("distil", self.distil_steps),
+            ("distil", self.distil_steps if self.member_steps else 0),
+            ("held", self.held_steps),
+            ("held_distil", self.distil_steps if self.held_steps else 0),
             ("clone", self.clone_steps),
         )

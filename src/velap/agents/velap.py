@@ -50,7 +50,7 @@ class VelapAgent:
         self.last_values: NDArray[np.float32] = np.empty(0, np.float32)
         """[B] Q^g of the last states, less what standing there before has cost (`revisit_penalty`) [Q-value]."""
         self.near_goal: NDArray[np.bool_] = np.empty(0, bool)
-        """[B] rows that π^g led in the last `act` because the goal was near."""
+        """[B] rows that π^g or a policy in its place led in the last `act` because the goal was near."""
         self.led_by_success: NDArray[np.bool_] = np.empty(0, bool)
         """[B] rows that the policy cloned from successes led in the last `act`."""
         self._model, self._states = model, StateEncoder(model)
@@ -60,6 +60,9 @@ class VelapAgent:
         self._lookahead, self._samples = config.controller.lookahead, config.controller.lookahead_samples
         self._gain, self._goal_lookahead = config.controller.lookahead_gain, config.controller.goal_lookahead
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
+        self._lead = model.act_global if model.held_policy is None else model.held_policy
+        close = config.controller.success_exponent
+        self._success_value = q_from_steps(close, self._fns.discount) if close > 0 else None
         self._waypoint_exponent = config.controller.waypoint_exponent
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
         shortcut = config.controller.shortcut_exponent
@@ -134,6 +137,10 @@ class VelapAgent:
             actions = torch.where(by_waypoint[:, None], local, actions)
         if led is not None:
             actions = torch.where(led.arrives[:, None], led.actions, actions)
+        if self._success_value is not None and self._fns.act_success is not None:
+            close = values > self._success_value
+            actions = torch.where(close[:, None], self._fns.act_success(latents), actions)
+            self.led_by_success |= close.cpu().numpy()
         if self._residuals is not None:
             self._residuals.acted(latents, actions)
         return self._states.act(actions)
@@ -160,8 +167,9 @@ class VelapAgent:
         return actions[torch.arange(len(actions), device=actions.device), q_min.argmax(1)]
 
     def _act_global(self, latents: Tensor) -> Tensor:
-        """π^g, or the best of it and stronger versions of its action under the dynamics, by Q^g (ours): actions [B, A]."""
-        policy = self._model.act_global(latents)
+        """π^g or the held policy, or the best of it and stronger versions of its action under the dynamics, by Q^g (ours):
+        actions [B, A]."""
+        policy = self._lead(latents)
         if self._goal_lookahead == 0:
             return policy
         gains = torch.tensor(GAINS, device=policy.device).view(-1, 1)

@@ -114,12 +114,18 @@ class WindowSampler:
             goals=goals._replace(proceeds=goals.proceeds * proceeds),
         )
 
-    def successes(self) -> Tensor:
-        """Rows int64 [*] of the training transitions of successful episodes; raises DatasetError where there are none."""
+    def successes(self, reach: int = 0) -> Tensor:
+        """Rows int64 [*] of the training transitions of successful episodes, with a `reach` above 0 of those at most so many
+        steps before a reward; raises DatasetError where there are none."""
         if len(self.rewarded) == 0:
             raise DatasetError("the dataset has no successful episode to clone; expected at least one with a reward of 1. "
                                "Collect or label some successes, or set `clone_steps` to 0.")
-        return self.transitions[torch.isin(self.first[self.transitions], self.first[self.rewarded])]
+        rows = self.transitions[torch.isin(self.first[self.transitions], self.first[self.rewarded])]
+        if reach == 0:
+            return rows
+        following = torch.searchsorted(self.rewarded, rows).clamp(max=len(self.rewarded) - 1)
+        ahead = self.rewarded[following] - rows
+        return rows[(ahead >= 0) & (ahead <= reach) & (self.first[self.rewarded[following]] == self.first[rows])]
 
     def _draw(self, positions: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """`count` of the positions without repetition, or all of them where they are no more or `count` is 0."""

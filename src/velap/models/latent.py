@@ -41,7 +41,7 @@ class Spaces:
 
 
 class LatentModel(nn.Module):
-    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1, and a policy cloned from successes where the config has one.
+    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1, and a policy cloned from successes and a held one where the config has them.
 
     Actions are in [-1, 1] inside; `to_env` and `to_unit` convert.
     """
@@ -60,6 +60,7 @@ class LatentModel(nn.Module):
         self.local_critics = EnsembleMLP(config.n_ens, 2 * latent + action, config.critic_dense, norm)
         self.global_critic = EnsembleMLP(config.n_global, latent + action, config.critic_dense, norm)
         self.success_policy = Policy(latent, config.policy_dense, action, norm) if config.success_policy else None
+        self.held_policy = Policy(latent, config.policy_dense, action, norm) if config.held_policy else None
         if config.critic_bounded:
             for critic in (self.local_critics, self.global_critic):
                 nn.init.constant_(critic.biases[-1], UNREWARDED)
@@ -259,14 +260,14 @@ WEIGHTS_SHA256 = "weights_sha256"
 """Metadata key: hash of weights and config alone, the same for the same training however long it took."""
 SHARED_SHA256 = "shared_sha256"
 """Metadata key: hash of the weights that heads and other methods share; see `shared_weights`."""
-OWN_WEIGHTS = ("success_policy.", "bank_")
+OWN_WEIGHTS = ("success_policy.", "held_policy.", "bank_")
 """Weights that VELAP's tree and controller alone act by."""
 
 
 def shared_weights(metadata: Mapping[str, str]) -> str:
     """What heads and the records of other methods name of a joint checkpoint: the weights without VELAP's own.
 
-    Planner, controller and the policy of successes may then change beside them. Older files have the hash of everything.
+    Planner, controller and VELAP's own policies may then change beside them. Older files have the hash of everything.
     """
     return metadata.get(SHARED_SHA256, metadata.get(WEIGHTS_SHA256, "none"))
 

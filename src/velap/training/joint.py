@@ -84,10 +84,13 @@ class JointLearner:
         self.members: Members | None = None
         if config.member_steps > 0:
             self.members = Members(model, config, sampler, generator)
+        self.held: Members | None = None
+        if config.held_steps > 0:
+            self.held = Members(model, config, sampler, generator, hold=config.held_actions)
         self.clone_optimizer, self.clones = None, None
         if config.clone_steps > 0:
             assert model.success_policy is not None, "clone_steps asks for success_policy"
-            self.successes = sampler.successes()
+            self.successes = sampler.successes(config.clone_reach)
             self.clone_optimizer = self._optimise_clone()
             self.clones = Clones(model.success_policy) if config.clone_candidates > 1 else None
         self.cache: Tensor | None = None
@@ -113,7 +116,7 @@ class JointLearner:
     def companions(self) -> dict[str, nn.Module]:
         """Target critics by name, and what is thrown away in the end."""
         extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions,
-                 "clones": self.clones, "members": self.members}
+                 "clones": self.clones, "members": self.members, "held": self.held}
         kept = {name: module for name, module in extra.items() if module is not None}
         return {"local": self.local_target, "global": self.global_target, **kept}
 
@@ -122,8 +125,8 @@ class JointLearner:
         """Optimisers by name."""
         extra = {"pairs": self.pair_optimizer, "clone": self.clone_optimizer}
         kept = {name: optimizer for name, optimizer in extra.items() if optimizer is not None}
-        own = {} if self.members is None else self.members.optimizers
-        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **kept, **own}
+        own = [item for each in (self.members, self.held) if each is not None for item in each.optimizers.items()]
+        return {"model": self.model_optimizer, "policy": self.policy_optimizer, **kept, **dict(own)}
 
     def _optimise(self, learning_rate: float, encoder: bool) -> None:
         """Fresh optimisers; the encoder is left out in the latent phase."""
@@ -250,17 +253,17 @@ class JointLearner:
             loss.backward()
             return {**info, **self._step(latents, batch, policies)}
 
-    def member_step(self) -> Info:
-        """One update of the members' critics, and of their policies in their turn, on cached latents (ours)."""
-        members, cache = self.members, self.cache
-        assert members is not None and cache is not None, "member_steps is 0, or begin_latent_phase is still to come"
-        return self._run_in_turn("members", lambda policies: members.update(cache, policies, self.generator))
+    def member_step(self, held: bool = False) -> Info:
+        """One update of the members, or of those of the held policy, on cached latents (ours)."""
+        members, cache = self.held if held else self.members, self.cache
+        assert members is not None and cache is not None, "there are no members, or begin_latent_phase is still to come"
+        return self._run_in_turn(members.name, lambda policies: members.update(cache, policies, self.generator))
 
-    def distil_step(self) -> Info:
-        """One update of π^g and Q^g towards the members' median and mean, on cached latents (ours)."""
-        members, cache = self.members, self.cache
-        assert members is not None and cache is not None, "member_steps is 0, or begin_latent_phase is still to come"
-        return self._run("distil", lambda: members.distil(self.model, cache, self.generator))
+    def distil_step(self, held: bool = False) -> Info:
+        """One update of π^g and Q^g, or of the held policy, towards their members, on cached latents (ours)."""
+        members, cache = self.held if held else self.members, self.cache
+        assert members is not None and cache is not None, "there are no members, or begin_latent_phase is still to come"
+        return self._run(f"{members.name} distil", lambda: members.distil(self.model, cache, self.generator))
 
     def clone_step(self, done: int, steps: int) -> Info:
         """Update `done` of the `steps` that clone policies from successes, on cached latents: mean-squared error as in D.1
@@ -301,8 +304,11 @@ class JointLearner:
         if phase == "clone":
             return self.clone_step(done, steps)
         self.set_learning_rate(self.config.latent_learning_rate * cosine(done / steps))
-        steps_of = {"latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step,
-                    "members": self.member_step, "distil": self.distil_step}
+        steps_of: dict[str, Callable[[], Info]] = {
+            "latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step,
+            "members": self.member_step, "distil": self.distil_step,
+            "held": partial(self.member_step, held=True), "held_distil": partial(self.distil_step, held=True),
+        }
         return steps_of[phase]()
 
     def _run_in_turn(self, name: str, update: Callable[[bool], Info], capture: bool = True) -> Info:

@@ -21,7 +21,7 @@ from velap.config import Config, older_fields
 from velap.data.episodes import FrameStore
 from velap.data.windows import WindowSampler
 from velap.errors import CheckpointError, ConfigError, DatasetError
-from velap.models.latent import LatentModel, Spaces, save_checkpoint
+from velap.models.latent import OWN_WEIGHTS, LatentModel, Spaces, load_checkpoint, save_checkpoint
 from velap.models.moments import MomentEncoder
 from velap.runs import MetricsLog, make_generator, write_atomic
 from velap.training.diagnostics import diagnose, measure_latents
@@ -31,6 +31,10 @@ from velap.training.state import SCHEDULE, load_state, save_state
 from velap.training.steps import Cadence, Progress, cosine, interrupt_flag, run_steps
 
 STATE, MODEL = "state.safetensors", "model.safetensors"
+OWN_PHASES = ("held", "held_distil", "clone")
+"""Phases that teach VELAP's own policies, the last ones."""
+OWN_STREAMS = {"held": 8, "clone": 6}
+"""Random numbers of those phases, so that they can be learnt again beside the same model."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,8 @@ class Trainer:
         self.generator = make_generator(seed, stream=1, device=device)
         self.learner = JointLearner(self.model, train, self.sampler, self.generator)
         self.step, self.seconds = 0, 0.0
+        self.adopted: dict[str, Tensor] = {}
+        """Weights taken from a finished checkpoint, by name."""
 
     @property
     def total(self) -> int:
@@ -129,8 +135,9 @@ class Trainer:
             info = learner.joint_step()
         else:
             self._freeze()
-            if phase == "clone" and done == 0:  # a stream of its own, so that cloning can be repeated beside the same model
-                self.generator.set_state(make_generator(self.seed, stream=6, device=self.device).get_state())
+            if phase in OWN_STREAMS and done == 0:
+                own = make_generator(self.seed, stream=OWN_STREAMS[phase], device=self.device)
+                self.generator.set_state(own.get_state())
             info = learner.frozen_step(phase, done, steps)
         self.step += 1
         return info
@@ -163,6 +170,25 @@ class Trainer:
         self._check_schedule(json.loads(metadata[SCHEDULE]), json.loads(identity[SCHEDULE]), int(metadata["step"]))
         self.step, self.seconds = int(metadata["step"]), float(metadata["seconds"])
 
+    def adopt(self, path: Path) -> None:
+        """Take all but VELAP's own policies from a finished checkpoint and begin where those are learnt.
+
+        Raises CheckpointError where its config, seed or data are others, or where nothing is left to learn.
+        """
+        model, config, metadata = load_checkpoint(path, self.device)
+        found = (config.shared_json(), metadata.get("seed"), metadata.get("dataset_hash"))
+        asked = (self.config.shared_json(), str(self.seed), self.store.content_hash)
+        wrong = [name for name, a, b in zip(("config", "seed", "dataset"), found, asked, strict=True) if a != b]
+        own = self.total - sum(steps for name, steps in self.config.train.phases if name in OWN_PHASES)
+        if wrong or own == self.total:
+            reason = f"has another {' and another '.join(wrong)}" if wrong else "leaves nothing to learn with this config"
+            raise CheckpointError(f"{path} {reason}; expected a finished checkpoint of the same task, preset, seed and "
+                                  "data, and a config with `held_steps` or `clone_steps`. Train without --base.")
+        self.adopted = {name: value for name, value in model.state_dict().items() if not name.startswith(OWN_WEIGHTS)}
+        self.model.load_state_dict(self.adopted, strict=False)
+        self.learner.begin_latent_phase()
+        self.step, self.seconds = own, float(metadata.get("train_seconds", 0))
+
     def _check_schedule(self, made: dict[str, object], asked: dict[str, object], step: int) -> None:
         """Raises CheckpointError where a phase after the joint one that has begun by `step` was made with other fields.
 
@@ -188,7 +214,7 @@ class Trainer:
         """
         train = older_fields("train", asdict(self.config.train))
         late = () if self.config.train.anneal else ("joint_steps",)
-        later = ("latent_", "clone_")
+        later = ("latent_", "held_", "clone_")
         schedule = {name: train.pop(name) for name in sorted(train) if name in late or name.startswith(later)}
         learned = {"task": self.config.task, "model": older_fields("model", asdict(self.config.model)), "train": train}
         return {
@@ -203,6 +229,7 @@ class Trainer:
         diagnostics = self.report()
         self.model.eval()
         measure_latents(self.model, self.sampler, make_generator(self.seed, stream=2))
+        self.model.load_state_dict(self.adopted, strict=False)  # their latents were measured before they were rounded
         provenance = {
             "command": command,
             "seed": str(self.seed),
@@ -220,7 +247,7 @@ class Trainer:
 def phase_of_field(name: str) -> str:
     """The phase that a field of the schedule belongs to; what several share belongs to the first of them."""
     parts = {"joint": ("joint_",), "dynamics": ("latent_dynamics_", "latent_priority", "latent_ridge"),
-             "values": ("latent_value_",), "clone": ("clone_",)}
+             "values": ("latent_value_",), "held": ("held_",), "clone": ("clone_",)}
     return next((phase for phase, prefixes in parts.items() if name.startswith(prefixes)), "latent")
 
 
@@ -232,11 +259,12 @@ def train(
     seed: int = 0,
     device: str = "auto",
     resume: bool = False,
+    base: Path | None = None,
     command: str = "velap.train",
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> TrainResult:
     """Train to the end. Ctrl-C saves the state and raises KeyboardInterrupt; `resume` goes on from there, to the same
-    bits on CPU.
+    bits on CPU. With `base`, a finished checkpoint, only VELAP's own policies are learnt, beside everything that it holds.
 
     Raises CheckpointError when `run_dir` holds another run, or an unfinished one and `resume` is off.
     """
@@ -244,6 +272,8 @@ def train(
     keep_freed_memory()
     trainer = Trainer(config, store, run_dir, seed, pick_device(device))
     resumed = None
+    if base is not None:
+        trainer.adopt(base)
     if (run_dir / STATE).exists():
         if not resume:
             raise CheckpointError(f"{run_dir} already holds a run. Add --resume to go on with it, or give another --out.")

@@ -19,6 +19,7 @@ from velap.models.latent import UNREWARDED, LatentModel
 from velap.models.networks import EnsembleMLP
 from velap.train_config import TrainConfig
 from velap.training.capture import adam
+from velap.training.held import hold as held_transitions
 from velap.training.losses import (
     Info,
     cloning_error,
@@ -33,37 +34,47 @@ CLOSE = 1e-4
 
 
 class Members(nn.Module):
-    """E pairs of policy and critics that learn Eq. 4 and 5 on cached latents; each draws transitions of its own."""
+    """E pairs of policy and critics that learn Eq. 4 and 5 on cached latents; each draws transitions of its own.
 
-    def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
+    With `hold` above 1 [steps] a transition is of so many steps, and the members are those of the held policy.
+    """
+
+    def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator,
+                 hold: int = 1) -> None:
         super().__init__()
         self.config, self.sampler, self.bound = config, sampler, model.bound
         shape, action = model.config, model.action_dim
         latent = shape.width(action)
-        self.count, self.n_global = config.members, shape.n_global
+        self.count, self.n_global = config.held_members if hold > 1 else config.members, shape.n_global
+        self.data = held_transitions(sampler, hold, config.discount)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(generator.initial_seed() + 2)
+            torch.manual_seed(generator.initial_seed() + (3 if hold > 1 else 2))
             self.policies = EnsembleMLP(self.count, latent, shape.policy_dense, shape.norm, action)
             self.critics = EnsembleMLP(self.count * self.n_global, latent + action, shape.critic_dense, shape.norm)
         if shape.critic_bounded:
             nn.init.constant_(self.critics.biases[-1], UNREWARDED)
         self.target = copy.deepcopy(self.critics).requires_grad_(False)
         self.to(sampler.device)
-        taught = (model.global_policy, model.global_critic)
+        self.taught: nn.Module = model.global_policy
+        values = [*model.global_critic.parameters()]
+        if hold > 1:
+            assert model.held_policy is not None, "held_steps asks for held_policy"
+            self.taught, values = model.held_policy, []
+        prefix, self.name = ("held_", "held") if hold > 1 else ("", "members")
         learnt = {
-            "member_critics": [*self.critics.parameters()],
-            "member_policies": [*self.policies.parameters()],
-            "distil": [p for module in taught for p in module.parameters()],
+            f"{prefix}member_critics": [*self.critics.parameters()],
+            f"{prefix}member_policies": [*self.policies.parameters()],
+            f"{prefix}distil": [*self.taught.parameters(), *values],
         }
         self.optimizers = {name: adam(parameters, config.latent_learning_rate) for name, parameters in learnt.items()}
-        """By name."""
+        """By name: of the critics, of the policies, of what they teach."""
         self.deviation: Tensor | None = None
         """float32 [D], of the cache."""
         self.error = critic_error(config.critic_loss, config.critic_floor)
 
     def update(self, cache: Tensor, policies: bool, generator: torch.Generator) -> Info:
         """One update of the critics, and of the policies where it is their turn. cache [F, D]."""
-        critics, acting = self.optimizers["member_critics"], self.optimizers["member_policies"]
+        critics, acting, _ = self.optimizers.values()
         rows = self.draw(self.count, generator)
         blur = self.blur(cache, rows, generator)
         critics.zero_grad(set_to_none=True)
@@ -80,10 +91,11 @@ class Members(nn.Module):
         return {**info, **more}
 
     def distil(self, model: LatentModel, cache: Tensor, generator: torch.Generator) -> Info:
-        """One update of the model's π^g and Q^g. cache [F, D]."""
-        optimizer = self.optimizers["distil"]
+        """One update of the model's π^g and Q^g, or of its held policy. cache [F, D]."""
+        *_, optimizer = self.optimizers.values()
         optimizer.zero_grad(set_to_none=True)
-        loss, info = self.distil_loss(model, cache, self.draw(1, generator)[0])
+        rows = self.draw(1, generator)[0]
+        loss, info = self.distil_loss(model, cache, rows) if self.taught is model.global_policy else self.lesson(cache, rows)
         loss.backward()
         optimizer.step()
         return info
@@ -115,13 +127,13 @@ class Members(nn.Module):
 
     def value_loss(self, cache: Tensor, rows: Tensor, blur: Tensor | float = 0.0) -> tuple[Tensor, Info]:
         """Eq. 4 of every member. cache [F, D], rows int64 [E, B], blur [E, B, D]."""
-        sampler, weight = self.sampler, torch.ones(rows.shape[1], device=rows.device)
+        data, weight = self.data, torch.ones(rows.shape[1], device=rows.device)
         with torch.no_grad():
-            then = cache[rows + 1] + blur
+            then = cache[data.following[rows]] + blur
             next_q = self.qs(self.target, then, self.act(then)).amin(1)
-            goal = td_target(sampler.rewards[rows], (~sampler.terminated[rows]).float(), next_q, self.config.discount)
-        loss, info = self.error(self.qs(self.critics, cache[rows] + blur, sampler.actions[rows]), goal.unsqueeze(1), weight)
-        return loss, {"members/loss": info["loss"], "members/q": info["q"]}
+            goal = td_target(data.rewards[rows], data.alive[rows], next_q, self.config.discount)
+        loss, info = self.error(self.qs(self.critics, cache[rows] + blur, data.actions[rows]), goal.unsqueeze(1), weight)
+        return loss, {f"{self.name}/loss": info["loss"], f"{self.name}/q": info["q"]}
 
     def acting_loss(self, cache: Tensor, rows: Tensor, blur: Tensor | float = 0.0) -> tuple[Tensor, Info]:
         """Eq. 5 of every member. cache [F, D], rows int64 [E, B], blur [E, B, D]."""
@@ -129,9 +141,9 @@ class Members(nn.Module):
         action = self.act(latents)
         q = self.qs(self.critics, latents, action).amin(1)
         weight = torch.ones(rows.shape[1], device=rows.device)
-        loss, info = policy_loss(q, action, self.sampler.actions[rows], self.config.c3, weight,
+        loss, info = policy_loss(q, action, self.data.actions[rows], self.config.c3, weight,
                                  relative=self.config.policy_relative)
-        return loss, {"members/policy": info["loss"], "members/imitation": info["imitation"]}
+        return loss, {f"{self.name}/policy": info["loss"], f"{self.name}/imitation": info["imitation"]}
 
     def distil_loss(self, model: LatentModel, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
         """The model's π^g against the members' actions, by distance, not by its square: it learns their median, and one that
@@ -149,3 +161,11 @@ class Members(nn.Module):
         acting = (cloning_error(action, actions) + CLOSE).sqrt().mean()
         values, _ = self.error(model.global_qs(latents.repeat(2, 1), at), value, torch.ones_like(value))
         return acting + values, {"distil/policy": acting.detach(), "distil/q": values.detach()}
+
+    def lesson(self, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
+        """The held policy against the members' actions, their median again. cache [F, D], rows int64 [B]."""
+        latents = cache[rows]
+        with torch.no_grad():
+            actions = self.act(latents.expand(self.count, -1, -1))
+        loss = (cloning_error(self.taught(latents), actions) + CLOSE).sqrt().mean()
+        return loss, {"held_distil/policy": loss.detach()}
