@@ -94,6 +94,15 @@ def test_each_phase_moves_the_policy_that_it_is_for(tmp_path):
     assert float((run.model.held_policy(cache).detach() - taught).abs().mean()) < apart, "between the two, or near one"
 
 
+def test_policies_of_held_members_learn_at_every_update(tmp_path):
+    run = until(make(tmp_path, own(policy_every=2)), "held")
+    for _ in range(3):
+        before = [p.clone() for p in run.learner.held.policies.parameters()]
+        run.update()
+        assert any(not torch.equal(a, b) for a, b in zip(before, run.learner.held.policies.parameters(), strict=True))
+    assert not any("held_policy" in name or "pupil" in name for name in run.learner.held.state_dict())
+
+
 def test_held_members_learn_from_held_transitions(tmp_path):
     run = until(make(tmp_path, own()), "held")
     run.update()

@@ -221,8 +221,8 @@ class ControllerConfig:
     Q^g above τ_goal, it acts and nothing is planned; 0 has none [steps]. ours: errors of h that a search exploits, a policy
     that knows nothing of h hardly meets."""
     success_exponent: float = 0.0
-    """The policy cloned from successes acts where Q^g, less what revisits cost, is above γ^this; 0 has none [steps]. ours:
-    the last steps to a success ask for more than Q^g tells, and what worked is in the data."""
+    """The policy cloned from successes acts where Q^g is above γ^this, as long as revisits do not say otherwise (τ_stop); 0
+    has none [steps]. ours: the last steps to a success ask for more than Q^g tells, and what worked is in the data."""
     revisit_penalty: float = 0.0
     """Every state that the episode has been in moves the goal away from its surroundings by this [steps]; 0 trusts Q^g.
     ours: plans and π^g then leave places that promise the goal and do not keep it."""

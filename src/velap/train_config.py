@@ -155,7 +155,7 @@ class TrainConfig:
     tell by several steps than by one."""
     held_actions: int = 5
     """Steps of those transitions; their action is the mean of as many [steps]. ours."""
-    held_members: int = 4
+    held_members: int = 3
     """Those members. ours."""
     latent_heads: bool = True
     """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""

@@ -117,7 +117,7 @@ class VelapAgent:
         latents = self._states(frames)
         if self._residuals is not None:
             self._residuals.observe(latents)
-        values = self._fns.value(latents)
+        values = promised = self._fns.value(latents)
         if self._revisits is not None:
             values = self._revisits.observe(latents, values)
         near_goal = values > self._stop_value
@@ -138,7 +138,7 @@ class VelapAgent:
         if led is not None:
             actions = torch.where(led.arrives[:, None], led.actions, actions)
         if self._success_value is not None and self._fns.act_success is not None:
-            close = values > self._success_value
+            close = near_goal & (promised > self._success_value)
             actions = torch.where(close[:, None], self._fns.act_success(latents), actions)
             self.led_by_success |= close.cpu().numpy()
         if self._residuals is not None:

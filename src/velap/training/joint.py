@@ -257,6 +257,8 @@ class JointLearner:
         """One update of the members, or of those of the held policy, on cached latents (ours)."""
         members, cache = self.held if held else self.members, self.cache
         assert members is not None and cache is not None, "there are no members, or begin_latent_phase is still to come"
+        if held:  # their policies learn at every update: half as many solve half as much
+            return self._run(members.name, lambda: members.update(cache, True, self.generator))
         return self._run_in_turn(members.name, lambda policies: members.update(cache, policies, self.generator))
 
     def distil_step(self, held: bool = False) -> Info:

@@ -55,16 +55,12 @@ class Members(nn.Module):
             nn.init.constant_(self.critics.biases[-1], UNREWARDED)
         self.target = copy.deepcopy(self.critics).requires_grad_(False)
         self.to(sampler.device)
-        self.taught: nn.Module = model.global_policy
-        values = [*model.global_critic.parameters()]
-        if hold > 1:
-            assert model.held_policy is not None, "held_steps asks for held_policy"
-            self.taught, values = model.held_policy, []
+        self.hold, values = hold, [] if hold > 1 else [*model.global_critic.parameters()]
         prefix, self.name = ("held_", "held") if hold > 1 else ("", "members")
         learnt = {
             f"{prefix}member_critics": [*self.critics.parameters()],
             f"{prefix}member_policies": [*self.policies.parameters()],
-            f"{prefix}distil": [*self.taught.parameters(), *values],
+            f"{prefix}distil": [*self.pupil(model).parameters(), *values],
         }
         self.optimizers = {name: adam(parameters, config.latent_learning_rate) for name, parameters in learnt.items()}
         """By name: of the critics, of the policies, of what they teach."""
@@ -95,10 +91,17 @@ class Members(nn.Module):
         *_, optimizer = self.optimizers.values()
         optimizer.zero_grad(set_to_none=True)
         rows = self.draw(1, generator)[0]
-        loss, info = self.distil_loss(model, cache, rows) if self.taught is model.global_policy else self.lesson(cache, rows)
+        loss, info = self.lesson(model, cache, rows) if self.hold > 1 else self.distil_loss(model, cache, rows)
         loss.backward()
         optimizer.step()
         return info
+
+    def pupil(self, model: LatentModel) -> nn.Module:
+        """The policy that they teach."""
+        if self.hold == 1:
+            return model.global_policy
+        assert model.held_policy is not None, "held_steps asks for held_policy"
+        return model.held_policy
 
     def draw(self, members: int, generator: torch.Generator) -> Tensor:
         """Rows of transitions from all over the data: int64 [members, B]."""
@@ -162,10 +165,10 @@ class Members(nn.Module):
         values, _ = self.error(model.global_qs(latents.repeat(2, 1), at), value, torch.ones_like(value))
         return acting + values, {"distil/policy": acting.detach(), "distil/q": values.detach()}
 
-    def lesson(self, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
+    def lesson(self, model: LatentModel, cache: Tensor, rows: Tensor) -> tuple[Tensor, Info]:
         """The held policy against the members' actions, their median again. cache [F, D], rows int64 [B]."""
         latents = cache[rows]
         with torch.no_grad():
             actions = self.act(latents.expand(self.count, -1, -1))
-        loss = (cloning_error(self.taught(latents), actions) + CLOSE).sqrt().mean()
+        loss = (cloning_error(self.pupil(model)(latents), actions) + CLOSE).sqrt().mean()
         return loss, {"held_distil/policy": loss.detach()}
