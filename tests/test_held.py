@@ -163,8 +163,24 @@ def test_the_clone_acts_near_the_goal_and_the_held_policy_before():
     np.testing.assert_allclose(VelapAgent(model, settings).act(frames)[1], [0.0, 1.0], atol=0.03)
 
 
+def test_the_held_policy_and_the_global_one_take_turns():
+    settings = override(toy_config(n_iter=20), model={"held_policy": True},
+                        controller={"stop_exponent": 90.0, "held_turn": 2})
+    model = ToyModel()
+    model.held_policy = lambda z: z.new_tensor([0.0, -0.5]).expand_as(z)
+    agent, frames = VelapAgent(model, settings), np.stack([draw(np.array(GOAL) - [3.0, 0.0])[None]] * 2)
+    down = []
+    for step in range(7):
+        if step == 3:
+            agent.reset(np.array([False, True]))
+        down.append((agent.act(frames)[:, 1] < -0.5).tolist())
+    assert [row[0] for row in down] == [True, True, False, False, True, True, False]
+    assert [row[1] for row in down] == [True, True, False, True, True, False, False], "a new episode begins with its own"
+
+
 def test_settings_without_their_policy_are_refused():
-    for part, fields in (("train", {"held_steps": 4, "distil_steps": 4}), ("controller", {"success_exponent": 3.0})):
+    for part, fields in (("train", {"held_steps": 4, "distil_steps": 4}), ("controller", {"success_exponent": 3.0}),
+                         ("controller", {"held_turn": 3})):
         with pytest.raises(ConfigError, match="is off"):
             override(config(), **{part: fields})
     with pytest.raises(ConfigError, match="stop_exponent"):

@@ -220,6 +220,9 @@ class ControllerConfig:
     """At every step the policy cloned from successes (`success_policy`) is simulated this far; where it gets to a node with
     Q^g above τ_goal, it acts and nothing is planned; 0 has none [steps]. ours: errors of h that a search exploits, a policy
     that knows nothing of h hardly meets."""
+    held_turn: int = 0
+    """The policy of `held_policy` and π^g lead in turns of so many steps, that one first; 0 never lets π^g lead beside it
+    [steps]. ours: where one of them stands still the other seldom does."""
     success_exponent: float = 0.0
     """The policy cloned from successes acts where Q^g is above γ^this, as long as revisits do not say otherwise (τ_stop); 0
     has none [steps]. ours: the last steps to a success ask for more than Q^g tells, and what worked is in the data."""
@@ -233,6 +236,7 @@ class ControllerConfig:
         require(self.shortcut_exponent >= 0, "shortcut_exponent", self.shortcut_exponent, "0 or more")
         require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
         require(self.success_rollout >= 0, "success_rollout", self.success_rollout, "0 or more steps")
+        require(self.held_turn >= 0, "held_turn", self.held_turn, "0 or more steps")
         require(0 <= self.success_exponent <= self.stop_exponent, "success_exponent", self.success_exponent,
                 "0 to `stop_exponent` steps")
         require(self.goal_lookahead >= 0, "goal_lookahead", self.goal_lookahead, "0 or more steps")
@@ -269,8 +273,8 @@ class Config:
                  "success_exponent": self.controller.success_exponent}
         for name, steps in asked.items():
             require(self.model.success_policy or steps == 0, name, steps, "0 where `success_policy` is off")
-        require(self.model.held_policy or self.train.held_steps == 0, "held_steps", self.train.held_steps,
-                "0 where `held_policy` is off")
+        for name, steps in (("held_steps", self.train.held_steps), ("held_turn", self.controller.held_turn)):
+            require(self.model.held_policy or steps == 0, name, steps, "0 where `held_policy` is off")
 
     def to_json(self) -> str:
         """Canonical JSON: sorted keys, so that equal configs are equal text.
@@ -392,7 +396,7 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
     ),
     "planner": ("rehearsals", "rehearsal_paths", "rehearsal_noise"),
     "controller": ("residuals", "shortcut_exponent", "lookahead_gain", "goal_lookahead", "revisit_penalty",
-                   "success_rollout", "success_exponent"),
+                   "success_rollout", "success_exponent", "held_turn"),
 }
 """Fields that `Config.to_json` leaves out at their defaults, which change nothing."""
 

@@ -280,7 +280,7 @@ TASKS: dict[str, Task] = {
                 "train": {"c3": 0.5},
                 "planner": {"n_sim": 10},
             },
-            # two subtasks: less imitation; far from the goal held actions, near it what has worked
+            # two subtasks: less imitation; far from the goal held actions and π^g in turns, near it what has worked
             default_overrides={
                 **_ALL_MOMENTS_DEFAULTS,
                 "model": {**_ALL_MOMENTS_DEFAULTS["model"], "held_policy": True, "success_policy": True},
@@ -292,7 +292,7 @@ TASKS: dict[str, Task] = {
                     "clone_candidates": 1,
                     "clone_reach": 25,
                 },
-                "controller": {**_ALL_MOMENTS_DEFAULTS["controller"], "success_exponent": 30.0},
+                "controller": {**_ALL_MOMENTS_DEFAULTS["controller"], "held_turn": 8, "success_exponent": 30.0},
             },
         ),
     )

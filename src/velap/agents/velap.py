@@ -60,7 +60,7 @@ class VelapAgent:
         self._lookahead, self._samples = config.controller.lookahead, config.controller.lookahead_samples
         self._gain, self._goal_lookahead = config.controller.lookahead_gain, config.controller.goal_lookahead
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
-        self._lead = model.act_global if model.held_policy is None else model.held_policy
+        self._turn = config.controller.held_turn
         close = config.controller.success_exponent
         self._success_value = q_from_steps(close, self._fns.discount) if close > 0 else None
         self._waypoint_exponent = config.controller.waypoint_exponent
@@ -79,6 +79,7 @@ class VelapAgent:
         if config.controller.revisit_penalty > 0:
             self._revisits = Revisits(config.controller.revisit_penalty, self._fns.step_distance, self._fns.discount)
         self._generators: list[torch.Generator] = []
+        self._steps = torch.empty(0, dtype=torch.long)
         self._plan_age = torch.empty(0, dtype=torch.long)
         self._waypoints = torch.empty(0, 1, 0)
         self._length = torch.empty(0, dtype=torch.long)
@@ -93,6 +94,7 @@ class VelapAgent:
             self._generators[row].manual_seed(seed)
         self._states.forget(mask)
         started = torch.from_numpy(mask).to(self._device)
+        self._steps[started] = 0
         self._plan_age[started] = self._n_replan
         self._length[started] = 0
         if self._residuals is not None:
@@ -103,6 +105,7 @@ class VelapAgent:
     def _allocate(self, batch: int) -> None:
         """Empty state for `batch` rows."""
         self._generators = [torch.Generator().manual_seed(row) for row in range(batch)]
+        self._steps = torch.zeros(batch, dtype=torch.long, device=self._device)
         self._plan_age = torch.full((batch,), self._n_replan, device=self._device)
         self._waypoints = torch.zeros(batch, 1, 0, device=self._device)
         self._length = torch.zeros(batch, dtype=torch.long, device=self._device)
@@ -127,6 +130,7 @@ class VelapAgent:
         self._replan(latents, (self._plan_age >= self._n_replan) & ~(near_goal if led is None else near_goal | led.arrives))
         self._advance(latents)
         self._plan_age += 1
+        self._steps += 1
 
         # A plan of the root alone leads nowhere, and a row near the goal may have none: π^g acts in both.
         by_waypoint = ~near_goal & (self._length > 1)
@@ -167,8 +171,8 @@ class VelapAgent:
         return actions[torch.arange(len(actions), device=actions.device), q_min.argmax(1)]
 
     def _act_global(self, latents: Tensor) -> Tensor:
-        """π^g or the held policy, or the best of it and stronger versions of its action under the dynamics, by Q^g (ours):
-        actions [B, A]."""
+        """What leads, or the best of it and stronger versions of its action under the dynamics, by Q^g (ours): actions
+        [B, A]."""
         policy = self._lead(latents)
         if self._goal_lookahead == 0:
             return policy
@@ -176,6 +180,16 @@ class VelapAgent:
         actions = (gains * policy.unsqueeze(1)).clamp(-1, 1)
         ends = self._held(latents, actions, self._fns.step, self._goal_lookahead)
         return actions[torch.arange(len(actions), device=actions.device), self._fns.value(ends).argmax(1)]
+
+    def _lead(self, latents: Tensor) -> Tensor:
+        """π^g, or the held policy where there is one, or both in turns: actions [B, A]."""
+        if self._model.held_policy is None:
+            return self._model.act_global(latents)
+        held = self._model.held_policy(latents)
+        if self._turn == 0:
+            return held
+        first = (self._steps - 1) // self._turn % 2 == 0
+        return torch.where(first[:, None], held, self._model.act_global(latents))
 
     @staticmethod
     def _held(latents: Tensor, actions: Tensor, step: Step, count: int) -> Tensor:
