@@ -79,15 +79,15 @@ def test_every_candidate_begins_anew_and_the_best_one_ends_in_the_model(tmp_path
         state = {k: v.clone() for k, v in run.model.success_policy.state_dict().items()}
         if step % 3 == 0:
             begun.append(state["0.weight"])
-            assert len(run.learner.clone_optimizer.state) and run.learner.clone_optimizer.param_groups[0]["lr"] == 1e-3
-            moments = next(iter(run.learner.clone_optimizer.state.values()))
+            assert len(run.learner.cloning.optimizer.state) and run.learner.cloning.optimizer.param_groups[0]["lr"] == 1e-3
+            moments = next(iter(run.learner.cloning.optimizer.state.values()))
             assert float(moments["step"]) == 1, "an optimiser of its own"
         assert ("clone/arrival_rate" in info) == (step % 3 == 2)
         if step % 3 == 2:
             kept.append(state)
     assert not torch.allclose(begun[0], begun[1], atol=0.05), "weights of their own"
     final = run.model.success_policy.state_dict()
-    assert all(torch.equal(final[k], run.learner.clones.best.state_dict()[k]) for k in final)
+    assert all(torch.equal(final[k], run.learner.cloning.candidates.best.state_dict()[k]) for k in final)
     # at the last update the model already holds the winner again: the second
     assert all(torch.equal(final[k], kept[1][k]) for k in final)
 
@@ -106,13 +106,13 @@ def test_a_resume_between_and_within_candidates_goes_on_to_the_same_bits(tmp_pat
         again.update()
     expected = straight.model.state_dict()
     assert all(torch.equal(v, expected[k]) for k, v in again.model.state_dict().items())
-    assert torch.equal(again.learner.clones.rate, straight.learner.clones.rate)
+    assert torch.equal(again.learner.cloning.candidates.rate, straight.learner.cloning.candidates.rate)
 
 
 def test_one_candidate_keeps_the_weights_it_has(tmp_path) -> None:
     run = Trainer(config(CLONED, clone_steps=1), make_store(), tmp_path, 0, torch.device("cpu"))
     before = run.model.success_policy[0].weight.clone()
-    assert run.learner.clones is None
+    assert run.learner.cloning.candidates is None
     while run.step < run.total:
         info = run.update()
     assert "clone/arrival_rate" not in info

@@ -368,8 +368,8 @@ def test_the_clone_phase_moves_the_policy_of_successes_alone_towards_their_actio
     changed = {k.split(".")[0] for k, v in run.model.state_dict().items() if not torch.equal(v, before[k])}
     assert changed == {"success_policy"}
     # two successful episodes of six steps in the store, none held out
-    assert run.sampler.episodes[run.sampler.rank_of_row[run.learner.successes]].unique().tolist() == [0, 1]
-    assert len(run.learner.successes) == 12 and last < 0.7 * first, "noise, learnt by heart"
+    assert run.sampler.episodes[run.sampler.rank_of_row[run.learner.cloning.rows]].unique().tolist() == [0, 1]
+    assert len(run.learner.cloning.rows) == 12 and last < 0.7 * first, "noise, learnt by heart"
 
 
 def test_a_resume_in_the_clone_phase_goes_on_to_the_same_bits(tmp_path):

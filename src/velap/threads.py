@@ -7,6 +7,9 @@ from contextlib import contextmanager
 
 import torch
 
+TRANSITIONS_A_THREAD = 512
+"""Transitions of a batch up to which heads learn on one thread of a CPU. ours."""
+
 
 @contextmanager
 def one_thread(device: torch.device, small: bool) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""Several policies cloned from the successes, of which the one that gets to the goal most often by the model is kept (ours).
+"""Policies cloned from the successes; of several the one that gets to the goal most often by the model is kept (ours).
 
 Successes cover a part of the states only; where a clone goes from anywhere else is an accident of its first weights. h and
 Q^g tell the accidents apart without an environment.
@@ -13,9 +13,15 @@ import copy
 import torch
 from torch import Tensor, nn
 
+from velap.data.windows import WindowSampler
 from velap.models.arrivals import arrivals
 from velap.models.horizon import q_from_steps
 from velap.models.latent import LatentModel
+from velap.threads import TRANSITIONS_A_THREAD, one_thread
+from velap.train_config import TrainConfig
+from velap.training.capture import adam
+from velap.training.latents import evaluated
+from velap.training.losses import Info, cloning_error
 
 STATES = 3_000
 """States of the data that are looked at; simulations start from the half of them that is farther from the goal by Q^g."""
@@ -69,3 +75,57 @@ class Clones(nn.Module):
             self.best.load_state_dict(model.success_policy.state_dict())
             self.rate.fill_(rate)
         return rate
+
+
+class Cloning:
+    """Learns the policy of successes on cached latents, mean-squared error as in D.1; `clone_candidates` policies share the
+    updates, one after the other."""
+
+    def __init__(self, policy: nn.Module, config: TrainConfig, sampler: WindowSampler) -> None:
+        self.policy, self.config, self.sampler = policy, config, sampler
+        self.rows = sampler.successes(config.clone_reach)
+        """int64 [*], transitions that are cloned."""
+        self.candidates = Clones(policy) if config.clone_candidates > 1 else None
+        self.optimizer = self._optimise()
+
+    def _optimise(self) -> torch.optim.Optimizer:
+        return adam(self.policy.parameters(), self.config.latent_learning_rate)
+
+    def _part(self, steps: int) -> int:
+        """Updates of a candidate [steps]."""
+        return -(-steps // self.config.clone_candidates)
+
+    def progress(self, done: int, steps: int) -> float:
+        """Share of the present candidate's updates that `done` of all `steps` leave behind."""
+        part = self._part(steps)
+        return done % part / min(part, steps - done // part * part)
+
+    def begin(self, done: int, steps: int, generator: torch.Generator) -> bool:
+        """Give a candidate whose first update comes weights and an optimiser of its own; says whether it did."""
+        if self.candidates is None or done % self._part(steps):
+            return False
+        fresh(self.policy, generator)
+        self.optimizer = self._optimise()
+        return True
+
+    def update(self, cache: Tensor, generator: torch.Generator) -> Info:
+        """One update. cache [F, D]."""
+        drawn = torch.randint(len(self.rows), (self.config.latent_batch,), generator=generator, device=self.rows.device)
+        rows = self.rows[drawn]
+        self.optimizer.zero_grad(set_to_none=True)
+        with one_thread(rows.device, len(rows) <= TRANSITIONS_A_THREAD):
+            loss = cloning_error(self.policy(cache[rows]), self.sampler.actions[rows]).mean()
+            loss.backward()
+            self.optimizer.step()
+        return {"clone/loss": loss.detach()}
+
+    def finish(self, model: LatentModel, cache: Tensor, done: int, steps: int, generator: torch.Generator) -> Info:
+        """Judge a candidate after its last update; after the last of all the best one is left in the model. cache [F, D]."""
+        part, last = self._part(steps), done == steps - 1
+        if self.candidates is None or not (done % part == part - 1 or last):
+            return {}
+        with evaluated(model):
+            rate = self.candidates.judge(model, cache, self.sampler.transitions, generator)
+        if last:
+            self.policy.load_state_dict(self.candidates.best.state_dict())
+        return {"clone/arrival_rate": torch.tensor(rate)}

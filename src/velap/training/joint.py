@@ -19,15 +19,14 @@ from torch import Tensor, nn
 from velap.data.windows import Batch, WindowSampler
 from velap.models.latent import LatentModel
 from velap.models.moments import MomentEncoder
-from velap.threads import one_thread
+from velap.threads import TRANSITIONS_A_THREAD, one_thread
 from velap.train_config import TrainConfig
 from velap.training.capture import Captured, adam, set_rate
-from velap.training.clones import Clones, fresh
+from velap.training.clones import Cloning
 from velap.training.latents import commands_before, encode_all, evaluated
 from velap.training.losses import (
     Info,
     action_model_loss,
-    cloning_error,
     critic_error,
     infonce_loss,
     policy_loss,
@@ -42,9 +41,6 @@ from velap.training.shifts import shifted
 from velap.training.slow import MomentObjective
 from velap.training.steps import cosine
 from velap.training.transitions import TransitionObjective
-
-TRANSITIONS_A_THREAD = 512
-"""Transitions of a batch up to which the heads work on one thread of a CPU. ours."""
 
 
 def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -87,12 +83,10 @@ class JointLearner:
         self.held: Members | None = None
         if config.held_steps > 0:
             self.held = Members(model, config, sampler, generator, hold=config.held_actions)
-        self.clone_optimizer, self.clones = None, None
+        self.cloning: Cloning | None = None
         if config.clone_steps > 0:
             assert model.success_policy is not None, "clone_steps asks for success_policy"
-            self.successes = sampler.successes(config.clone_reach)
-            self.clone_optimizer = self._optimise_clone()
-            self.clones = Clones(model.success_policy) if config.clone_candidates > 1 else None
+            self.cloning = Cloning(model.success_policy, config, sampler)
         self.cache: Tensor | None = None
         self.updates = 0
         self.graphs = sampler.device.type == "cuda"
@@ -116,14 +110,14 @@ class JointLearner:
     def companions(self) -> dict[str, nn.Module]:
         """Target critics by name, and what is thrown away in the end."""
         extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions,
-                 "clones": self.clones, "members": self.members, "held": self.held}
+                 "clones": None if self.cloning is None else self.cloning.candidates, "members": self.members, "held": self.held}
         kept = {name: module for name, module in extra.items() if module is not None}
         return {"local": self.local_target, "global": self.global_target, **kept}
 
     @property
     def optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Optimisers by name."""
-        extra = {"pairs": self.pair_optimizer, "clone": self.clone_optimizer}
+        extra = {"pairs": self.pair_optimizer, "clone": None if self.cloning is None else self.cloning.optimizer}
         kept = {name: optimizer for name, optimizer in extra.items() if optimizer is not None}
         own = [item for each in (self.members, self.held) if each is not None for item in each.optimizers.items()]
         return {"model": self.model_optimizer, "policy": self.policy_optimizer, **kept, **dict(own)}
@@ -140,11 +134,6 @@ class JointLearner:
         self.model_optimizer = adam(self.model_parameters, learning_rate)
         self.policy_optimizer = adam(self.policy_parameters, learning_rate)
         self._captured.clear()  # they step the old ones
-
-    def _optimise_clone(self) -> torch.optim.Optimizer:
-        """A fresh optimiser for the policy cloned from successes."""
-        assert self.model.success_policy is not None, "clone_steps asks for success_policy"
-        return adam(self.model.success_policy.parameters(), self.config.latent_learning_rate)
 
     def encoder_step(self) -> Info:
         """One update of the encoder alone, on pairs of states (ours)."""
@@ -257,7 +246,7 @@ class JointLearner:
         """One update of the members, or of those of the held policy, on cached latents (ours)."""
         members, cache = self.held if held else self.members, self.cache
         assert members is not None and cache is not None, "there are no members, or begin_latent_phase is still to come"
-        if held:  # their policies learn at every update: half as many solve half as much
+        if held:  # without TD3's delay
             return self._run(members.name, lambda: members.update(cache, True, self.generator))
         return self._run_in_turn(members.name, lambda policies: members.update(cache, policies, self.generator))
 
@@ -268,38 +257,14 @@ class JointLearner:
         return self._run(f"{members.name} distil", lambda: members.distil(self.model, cache, self.generator))
 
     def clone_step(self, done: int, steps: int) -> Info:
-        """Update `done` of the `steps` that clone policies from successes, on cached latents: mean-squared error as in D.1
-        (ours). The last one leaves the best of `clone_candidates` in the model."""
-        policy, cache = self.model.success_policy, self.cache
-        assert policy is not None and cache is not None, "begin_latent_phase comes first"
-        part = -(-steps // self.config.clone_candidates)
-        if self.clones is not None and done % part == 0:
-            fresh(policy, self.generator)
-            self.clone_optimizer = self._optimise_clone()
+        """Update `done` of the `steps` that clone policies from successes, on cached latents (ours)."""
+        cloning, cache = self.cloning, self.cache
+        assert cloning is not None and cache is not None, "clone_steps is 0, or begin_latent_phase is still to come"
+        if cloning.begin(done, steps, self.generator):
             self._captured.pop("clone", None)
-        length = min(part, steps - done // part * part)
-        self.set_learning_rate(self.config.latent_learning_rate * cosine(done % part / length))
-        info = self._run("clone", self._update_clone)
-        if self.clones is not None and (done % part == part - 1 or done == steps - 1):
-            with evaluated(self.model):
-                rate = self.clones.judge(self.model, cache, self.sampler.transitions, self.generator)
-            info = {**info, "clone/arrival_rate": torch.tensor(rate)}
-            if done == steps - 1:
-                policy.load_state_dict(self.clones.best.state_dict())
-        return info
-
-    def _update_clone(self) -> Info:
-        policy, cache = self.model.success_policy, self.cache
-        assert policy is not None and cache is not None and self.clone_optimizer is not None, "clone_steps is 0"
-        drawn = torch.randint(len(self.successes), (self.config.latent_batch,), generator=self.generator,
-                              device=self.successes.device)
-        rows = self.successes[drawn]
-        self.clone_optimizer.zero_grad(set_to_none=True)
-        with one_thread(rows.device, len(rows) <= TRANSITIONS_A_THREAD):
-            loss = cloning_error(policy(cache[rows]), self.sampler.actions[rows]).mean()
-            loss.backward()
-            self.clone_optimizer.step()
-        return {"clone/loss": loss.detach()}
+        self.set_learning_rate(self.config.latent_learning_rate * cosine(cloning.progress(done, steps)))
+        info = self._run("clone", lambda: cloning.update(cache, self.generator))
+        return {**info, **cloning.finish(self.model, cache, done, steps, self.generator)}
 
     def frozen_step(self, phase: str, done: int, steps: int) -> Info:
         """Update `done` of the `steps` of a phase that works on a frozen encoder, by its name in `TrainConfig.phases`."""
