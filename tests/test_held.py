@@ -169,6 +169,7 @@ def test_the_held_policy_and_the_global_one_take_turns():
     model = ToyModel()
     model.held_policy = lambda z: z.new_tensor([0.0, -0.5]).expand_as(z)
     agent, frames = VelapAgent(model, settings), np.stack([draw(np.array(GOAL) - [3.0, 0.0])[None]] * 2)
+    assert agent.leader == "held or global policy" and VelapAgent(ToyModel(), toy_config()).leader == "global policy"
     down = []
     for step in range(7):
         if step == 3:

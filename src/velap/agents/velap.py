@@ -61,6 +61,10 @@ class VelapAgent:
         self._gain, self._goal_lookahead = config.controller.lookahead_gain, config.controller.goal_lookahead
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._turn = config.controller.held_turn
+        self.leader = "global policy"
+        """What leads where no plan and no success does, in words."""
+        if model.held_policy is not None:
+            self.leader = "held or global policy" if self._turn else "held policy"
         close = config.controller.success_exponent
         self._success_value = q_from_steps(close, self._fns.discount) if close > 0 else None
         self._waypoint_exponent = config.controller.waypoint_exponent

@@ -93,7 +93,7 @@ class VideoRecorder:
         if agent.led_by_success[row]:
             return f"Q^g {value:.3f}, successes followed"
         if agent.near_goal[row] or len(waypoints) == 0:
-            return f"Q^g {value:.3f}, global policy acts"
+            return f"Q^g {value:.3f}, {agent.leader} acts"
         if self._map is not None:
             points = [tuple(point) for point in to_pixels(self._map.locate(waypoints), self._map.extent, TILE)]
             draw = ImageDraw.Draw(image)

@@ -109,8 +109,9 @@ class JointLearner:
     @property
     def companions(self) -> dict[str, nn.Module]:
         """Target critics by name, and what is thrown away in the end."""
-        extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions,
-                 "clones": None if self.cloning is None else self.cloning.candidates, "members": self.members, "held": self.held}
+        clones = None if self.cloning is None else self.cloning.candidates
+        extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions, "clones": clones,
+                 "members": self.members, "held": self.held}
         kept = {name: module for name, module in extra.items() if module is not None}
         return {"local": self.local_target, "global": self.global_target, **kept}
 
