@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
 from velap import cli
@@ -37,10 +38,12 @@ def shrunk() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An intact dataset and run."""
-    folder = tmp_path_factory.mktemp("base")
+    folder, threads = tmp_path_factory.mktemp("base"), torch.get_num_threads()
+    torch.set_num_threads(1)  # as the processes that are killed have: another number gives other bits
     for command in (["collect", "SpiralMaze"], ["train", "SpiralMaze", "--out", "run"]):
         code, stderr = run_here(command, folder)
         assert code == 0, stderr
+    torch.set_num_threads(threads)
     return folder
 
 
