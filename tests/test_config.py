@@ -7,7 +7,8 @@ import json
 
 import pytest
 
-from velap.config import Config, ControllerConfig, ModelConfig, PlannerConfig, override
+from velap.config import Config, ModelConfig, override
+from velap.control_config import ControllerConfig, PlannerConfig
 from velap.errors import ConfigError, UnknownTaskError
 from velap.tasks import PRESETS, TASKS, get_task, make_config
 from velap.train_config import TrainConfig

@@ -163,6 +163,20 @@ def test_the_clone_acts_near_the_goal_and_the_held_policy_before():
     np.testing.assert_allclose(VelapAgent(model, settings).act(frames)[1], [0.0, 1.0], atol=0.03)
 
 
+def test_revisits_do_not_take_the_lead_from_the_clone_before_they_call_for_a_plan():
+    settings = override(toy_config(n_iter=20), model={"success_policy": True},
+                        controller={"stop_exponent": 6.0, "success_exponent": 3.0, "revisit_penalty": 1.0})
+    agent = VelapAgent(ToyModel(act_success=lambda z: torch.full_like(z, -0.5)), settings)
+    frames, led, planned = draw(np.array(GOAL) - [2.0, 0.0])[None, None], [], []
+    for _ in range(12):
+        agent.act(frames)
+        led.append(bool(agent.led_by_success[0]))
+        planned.append(not bool(agent.near_goal[0]))
+    below = float(agent.last_values[0])
+    assert led[0] and led[2] and not led[-1] and planned[-1] and below < 0.96**6
+    assert all(a != b for a, b in zip(led, planned, strict=True))
+
+
 def test_the_held_policy_and_the_global_one_take_turns():
     settings = override(toy_config(n_iter=20), model={"held_policy": True},
                         controller={"stop_exponent": 90.0, "held_turn": 2})

@@ -25,7 +25,8 @@ import torch
 from torch import Tensor
 
 from velap.bench.demo import released_checkpoint
-from velap.config import ModelConfig, PlannerConfig, override
+from velap.config import ModelConfig, override
+from velap.control_config import PlannerConfig
 from velap.data.episodes import FrameStore, load_store, make_store, write_dataset
 from velap.errors import CheckpointError, VelapError
 from velap.models.latent import LatentModel, Spaces, load_checkpoint
