@@ -9,7 +9,7 @@ import math
 
 import torch
 
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.search.sampling import Noise
 from velap.search.types import SearchFns
 

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from velap.config import Config, ModelConfig
-from velap.data.episodes import FrameStore
-from velap.models.latent import LatentModel, Spaces, load_checkpoint, save_checkpoint
-from velap.train_config import TrainConfig
+from velap.config.training import TrainConfig
+from velap.data.frames import FrameStore
+from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
 from velap.training.frozen import LatentData
 
 SMALL = ModelConfig(

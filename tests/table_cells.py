@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from velap.bench.inventory import Finding, Inventory, Kind
-from velap.bench.matrix import Cell
-from velap.bench.records import Record, RecordFile, RunKey
-from velap.bench.timings import Timings
+from studies.inventory import Finding, Inventory, Kind
+from studies.matrix import Cell
+from studies.timings import Timings
+from velap.evaluation.records import Record, RecordFile, RunKey
 from velap.tasks import get_task
 
 RECORDS = Path("results/records")
@@ -40,7 +40,7 @@ class Pretended(Inventory):
 
     def look(self, kind: Kind, cell: Cell) -> Finding:
         """`finished` and `partly` name jobs, or kinds of jobs."""
-        from velap.bench.inventory import job_name
+        from studies.inventory import job_name
 
         names = {kind, job_name(kind, cell)}
         for name in names & self.partly.keys():

@@ -8,10 +8,10 @@ import torch
 
 from toy_env import ACTION_SCALE, SIDE, ToyEnv, ToyModel, draw, toy_config
 from toy_world import DISCOUNT, GOAL, SPEED, START, TIP
-from velap.agents.base import make_agent
-from velap.agents.velap import VelapAgent
 from velap.config import override
 from velap.errors import ConfigError
+from velap.methods.base import make_agent
+from velap.methods.velap import VelapAgent
 
 
 def frames_at(*positions: tuple[float, float]) -> np.ndarray:

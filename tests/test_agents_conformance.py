@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from velap import api, cli
-from velap.agents.base import METHODS, PAPER_SETTINGS, SETTINGS, Agent, make_agent, method_hash, method_settings
 from velap.config import Config, override
 from velap.errors import CheckpointError, ConfigError, UnknownTaskError
+from velap.methods.base import METHODS, PAPER_SETTINGS, SETTINGS, Agent, make_agent, method_hash, method_settings
 from velap.models.heads import HEADS, AnyHead, SubgoalHead, load_head, make_head, save_head
-from velap.models.latent import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
 
 LOW, HIGH = np.array([-1.0, 0.0, 2.0], np.float32), np.array([1.0, 4.0, 2.5], np.float32)
 ACTIONS = gym.spaces.Box(LOW, HIGH)

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from toy_env import ACTION_SCALE, ToyEnv, ToyModel, draw
 from toy_world import DISCOUNT, GOAL, START, geodesic, move, roots, unit
-from velap.agents import mpc
-from velap.agents.iris import IRISAgent
-from velap.agents.mpc import MPCAgent
-from velap.agents.planning import PlanningAgent
 from velap.errors import ConfigError
+from velap.methods import mpc
+from velap.methods.iris import IRISAgent
+from velap.methods.mpc import MPCAgent
+from velap.methods.planning import PlanningAgent
 from velap.search.manager import MULTISTEP, IRISConfig, choose_subgoal
 from velap.search.shooting import MBOPConfig, MPPIConfig, Shot
 

@@ -13,11 +13,11 @@ import torch
 
 import velap
 from velap import cli
-from velap.bench.records import read_records
-from velap.bench.settings import parse_settings
+from velap.cli.settings import parse_settings
 from velap.config import override
 from velap.errors import ConfigError
-from velap.models.latent import LatentModel, Spaces, save_checkpoint
+from velap.evaluation.records import read_records
+from velap.models.velap import LatentModel, Spaces, save_checkpoint
 from velap.tasks import TASKS, make_config
 
 ROOT = Path(__file__).resolve().parents[1]

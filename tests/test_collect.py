@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from velap.data import behaviours, cards, collect, minari_io
-from velap.data.episodes import FrameStore, load_positions, load_store
+from velap.data import behaviours, minari_io
+from velap.data import card as cards
+from velap.data import collection as collect
+from velap.data.frames import FrameStore, load_positions, load_store
 from velap.data.pool import Worker
 from velap.errors import DatasetError, RenderError, StorageError, UnknownTaskError
 from velap.tasks import Recipe, Task
@@ -64,7 +66,7 @@ gym.register("velap_test/Line-v0", entry_point="velap_line_env:Line", max_episod
 '''
 TASK = Task("Line", "velap_line_env:velap_test/Line-v0", "velap_line_env:Line", 50, Recipe(1, 24, 6, 1.0))
 SCRIPT = """
-from velap.data import collect
+from velap.data import collection as collect
 from velap.tasks import Recipe, Task
 collect.SHARD_TRAJECTORIES = 4
 task = Task("Line", "velap_line_env:velap_test/Line-v0", "velap_line_env:Line", 50, Recipe(1, 24, 6, 1.0))

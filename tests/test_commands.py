@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from test_joint import SMALL, config, make_store, straight_and_resumed
-from velap.agents.base import METHODS, make_agent
-from velap.agents.states import StateEncoder
 from velap.config import ModelConfig
 from velap.data.commands import past_commands
-from velap.data.windows import WindowSampler
+from velap.data.sampling import WindowSampler
 from velap.errors import ConfigError
+from velap.methods.base import METHODS, make_agent
+from velap.methods.states import StateEncoder
 from velap.models.heads import HEADS
-from velap.models.latent import LatentModel, Spaces
+from velap.models.velap import LatentModel, Spaces
 from velap.training.latents import encode_all
 from velap.training.loop import Trainer
 from velap.training.pairs import Pairs

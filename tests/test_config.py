@@ -8,10 +8,10 @@ import json
 import pytest
 
 from velap.config import Config, ModelConfig, override
-from velap.control_config import ControllerConfig, PlannerConfig
+from velap.config.planning import ControllerConfig, PlannerConfig
+from velap.config.training import TrainConfig
 from velap.errors import ConfigError, UnknownTaskError
 from velap.tasks import PRESETS, TASKS, get_task, make_config
-from velap.train_config import TrainConfig
 
 
 def test_the_paper_preset_is_the_tables() -> None:

@@ -17,9 +17,16 @@ from test_cli import untrained
 from toy_env import toy_config, toy_player
 from toy_world import GOAL, START, toy_fns
 from velap import cli
-from velap.bench import demo
-from velap.bench.diagnose_failures import CLASSES, REMEDIES, Trace, classify, judge, watch
-from velap.bench.diagnose_model import (
+from velap.config import ModelConfig
+from velap.config.training import TrainConfig
+from velap.data.frames import Extras, FrameStore, make_store, write_dataset
+from velap.data.sampling import WindowSampler
+from velap.envs.mazes.env import STEP_LENGTH, SpiralMaze
+from velap.envs.sawyer.tasks import DrawerButton
+from velap.evaluation.rollout import FrameReader
+from velap.report import demo
+from velap.report.diagnose.failures import CLASSES, REMEDIES, Trace, classify, judge, watch
+from velap.report.diagnose.model import (
     LED,
     Album,
     Pairs,
@@ -32,16 +39,9 @@ from velap.bench.diagnose_model import (
     rank_correlation,
     rollout_error,
 )
-from velap.bench.diagnose_plans import Starts, plan_strip, tree_numbers
-from velap.bench.diagnose_world import distances_to, look_at_scene, stack_all
-from velap.bench.rollout import FrameReader
-from velap.config import ModelConfig
-from velap.data.episodes import Extras, FrameStore, make_store, write_dataset
-from velap.data.windows import WindowSampler
-from velap.envs.block_maze import STEP_LENGTH, SpiralMaze
-from velap.envs.sawyer_tasks import DrawerButton
+from velap.report.diagnose.plans import Starts, plan_strip, tree_numbers
+from velap.report.diagnose.world import distances_to, look_at_scene, stack_all
 from velap.search.est import plan
-from velap.train_config import TrainConfig
 from velap.training.diagnostics import horizons
 
 DISCOUNT = 0.96

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from velap.envs.block_maze import MAX_SPEED, STEP_LENGTH, SpiralMaze
-from velap.envs.spiral import PIXEL
+from velap.envs.mazes.env import MAX_SPEED, STEP_LENGTH, SpiralMaze
+from velap.envs.mazes.spiral import PIXEL
 from velap.errors import ConfigError
 from velap.tasks import get_task
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from velap.envs.block_maze import STEP_LENGTH
-from velap.envs.geometry import Layout, Rect, frame_walls, polyline_walls
-from velap.envs.spiral import PIXEL, spiral_layout
+from velap.envs.mazes.env import STEP_LENGTH
+from velap.envs.mazes.geometry import Layout, Rect, frame_walls, polyline_walls
+from velap.envs.mazes.spiral import PIXEL, spiral_layout
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from velap.envs import meshes
-from velap.envs.meshes import Mesh, face_normals, merged, simplified
-from velap.envs.view import View
+from velap.envs.sawyer import meshes
+from velap.envs.sawyer.meshes import Mesh, face_normals, merged, simplified
+from velap.envs.sawyer.view import View
 
 
 def volume(mesh: Mesh) -> float:

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from velap.bench.experts import episode, goes_straight, heading_solves
-from velap.envs.block_maze import STEP_LENGTH
-from velap.envs.geometry import Layout
-from velap.envs.obstacle import CONTEXTS, TRAIN_CONTEXTS, ObstacleMaze, obstacle_layout
-from velap.envs.spiral import PIXEL, spiral_layout
+from velap.envs.mazes.env import STEP_LENGTH
+from velap.envs.mazes.geometry import Layout
+from velap.envs.mazes.obstacle import CONTEXTS, TRAIN_CONTEXTS, ObstacleMaze, obstacle_layout
+from velap.envs.mazes.spiral import PIXEL, spiral_layout
 from velap.errors import ConfigError
+from velap.evaluation.experts import episode, goes_straight, heading_solves
 from velap.tasks import get_task
 
 TASK = get_task("ObstacleMaze")

@@ -10,7 +10,7 @@ import pytest
 
 import velap.envs  # noqa: F401 - registers the tasks
 from velap.envs import gl, pixels
-from velap.envs.spiral import PIXEL
+from velap.envs.mazes.spiral import PIXEL
 from velap.errors import ConfigError, RenderError
 from velap.tasks import TASKS
 

@@ -7,8 +7,8 @@ import pytest
 from metaworld.envs import SawyerFaucetCloseEnvV3, SawyerWindowCloseEnvV3
 
 from velap.data.behaviours import mixture, run_trajectory
-from velap.envs import sawyer_tasks
-from velap.envs.sawyer import ACTION_SCALE
+from velap.envs.sawyer import tasks as sawyer_tasks
+from velap.envs.sawyer.physics import ACTION_SCALE
 from velap.tasks import TASKS, make_config
 
 SAWYER = ("WindowClose", "FaucetClose", "ButtonWall", "DrawerButton")

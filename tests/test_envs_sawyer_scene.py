@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from velap.bench.drawing import compare
+from studies.drawing import compare
 from velap.envs import gl
-from velap.envs.sawyer_parts import SHOWN_GROUPS
-from velap.envs.sawyer_scene import VIEW, OriginalScene, SawyerScene
-from velap.envs.view import View
+from velap.envs.sawyer.parts import SHOWN_GROUPS
+from velap.envs.sawyer.scene import VIEW, OriginalScene, SawyerScene
+from velap.envs.sawyer.view import View
 from velap.errors import RenderError
 from velap.tasks import TASKS
 

@@ -14,7 +14,7 @@ import torch
 from minari.data_collector.episode_buffer import EpisodeBuffer
 
 from velap.data import minari_io
-from velap.data.episodes import (
+from velap.data.frames import (
     Extras,
     FrameStore,
     content_hash,

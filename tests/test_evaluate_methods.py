@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from velap import cli
-from velap.bench.records import read_records
 from velap.config import override
+from velap.evaluation.records import read_records
 from velap.models.heads import HEADS, SubgoalHead, make_head, save_head
-from velap.models.latent import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
 from velap.tasks import make_config
 
 QUICK = ("samples=8", "horizon=6", "elites=2", "iterations=1")

@@ -9,9 +9,9 @@ import torch
 from rich.console import Console
 
 import velap.envs  # noqa: F401 - registers the tasks
-from velap.bench.exact import ExactEncoder, collect_states, pack, study_exact_latents, unpack
+from studies.exact import ExactEncoder, collect_states, pack, study_exact_latents, unpack
 from velap.data.behaviours import mixture, position_of, run_trajectory
-from velap.data.episodes import stack_indices
+from velap.data.frames import stack_indices
 from velap.errors import ConfigError
 from velap.tasks import get_task
 

@@ -16,11 +16,11 @@ import pytest
 import torch
 from rich.console import Console
 
+from studies import faults, kills, study
+from studies.faults import CASES, Case, Finding, changes, check, judge, listing, message_of
+from studies.kills import KillReport, Victim, fingerprint, kill_and_resume, leftovers, unreadable
+from studies.study import DISK_CASES, DiskCase, check_disk, report
 from velap import cli
-from velap.bench import faults, kills, study
-from velap.bench.faults import CASES, Case, Finding, changes, check, judge, listing, message_of
-from velap.bench.kills import KillReport, Victim, fingerprint, kill_and_resume, leftovers, unreadable
-from velap.bench.study import DISK_CASES, DiskCase, check_disk, report
 from velap.errors import VelapError
 from velap.runs import load_tensors, save_tensors
 from velap.tasks import TASKS

@@ -7,8 +7,8 @@ import torch
 from torch import nn
 
 from velap.config import Norm
-from velap.models.folded import folded_ensemble, folded_mlp
 from velap.models.networks import MLP, EnsembleMLP
+from velap.native.folded import folded_ensemble, folded_mlp
 
 NORMS: tuple[Norm, ...] = ("batch", "layer", "none")
 

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from velap.bench import gallery
-from velap.envs.obstacle import ObstacleMaze
+from studies import gallery
+from velap.envs.mazes.obstacle import ObstacleMaze
 from velap.errors import VelapError
 from velap.tasks import get_task
 

@@ -37,7 +37,7 @@ def same(one: Path, other: Path) -> bool:
 
 
 def test_every_head_has_a_recipe_and_every_method_a_way_to_train() -> None:
-    from velap.agents.base import METHODS
+    from velap.methods.base import METHODS
 
     assert RECIPES.keys() == HEADS.keys()
     assert {*RECIPES, *JOINT_METHODS, "random"} == set(METHODS)
@@ -213,7 +213,7 @@ def test_a_loss_that_is_not_a_number_stops_the_training(checkpoint: Path, method
 
 def test_the_command_line_trains_a_head_beside_the_joint_checkpoint(
         checkpoint: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("velap.data.episodes.load_store", lambda *args, **kwargs: STORE)
+    monkeypatch.setattr("velap.data.frames.load_store", lambda *args, **kwargs: STORE)
     monkeypatch.setattr(cli, "ERR", cli.Console(stderr=True, highlight=False, width=200))
     folder = str(checkpoint.parent)
     command = ["train", "--dataset", "test", "--out", folder, "--method", "iql", "--set", "head.steps=3"]
@@ -237,7 +237,7 @@ def test_the_command_line_trains_a_head_beside_the_joint_checkpoint(
 
 def test_the_joint_training_comes_first_where_it_is_missing(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("velap.data.episodes.load_store", lambda *args, **kwargs: STORE)
+    monkeypatch.setattr("velap.data.frames.load_store", lambda *args, **kwargs: STORE)
     quick = ["train.joint_steps=2", "train.latent_steps=2", "train.batch_windows=2", "train.window=5",
              "train.latent_batch=4", "train.precision=float32", "model.frame_stack=1", "head.steps=2", "train.log_every=1",
              "model.encoder_kernels=(4,)", "model.encoder_strides=(4,)", "model.encoder_filters=(4,)"]

@@ -12,10 +12,10 @@ import torch
 from test_joint import SMALL, config, make_store, straight_and_resumed
 from toy_env import ToyModel, draw, toy_config
 from toy_world import GOAL
-from velap.agents.velap import VelapAgent
 from velap.config import Config, override
 from velap.errors import CheckpointError, ConfigError
-from velap.models.latent import load_checkpoint, shared_weights
+from velap.methods.velap import VelapAgent
+from velap.models.velap import load_checkpoint, shared_weights
 from velap.training.held import hold
 from velap.training.loop import Trainer, train
 

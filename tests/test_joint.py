@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from velap.config import Config, ModelConfig
-from velap.data.episodes import FrameStore
+from velap.config.training import TrainConfig
+from velap.data.frames import FrameStore
 from velap.errors import CheckpointError, ConfigError, DatasetError
-from velap.models.latent import load_checkpoint
+from velap.models.velap import load_checkpoint
 from velap.runs import load_tensors
-from velap.train_config import TrainConfig
 from velap.training.joint import rollouts
 from velap.training.loop import MODEL, STATE, Trainer, train
 from velap.training.shifts import shifted

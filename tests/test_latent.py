@@ -8,7 +8,7 @@ import torch
 
 from velap.config import Config, ModelConfig
 from velap.errors import VelapError
-from velap.models.latent import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
 
 SMALL = ModelConfig(
     frame_stack=2,

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import tensor
 
-from velap.training.losses import (
+from velap.losses import (
     action_model_loss,
     critic_loss,
     cross_entropy_critic_loss,

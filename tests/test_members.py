@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from test_joint import SMALL, config, make_store, straight_and_resumed, touched
+from velap.config.training import TrainConfig
 from velap.errors import ConfigError
+from velap.losses import cross_entropy_critic_loss
 from velap.models.networks import EnsembleMLP
-from velap.train_config import TrainConfig
 from velap.training.loop import Trainer
-from velap.training.losses import cross_entropy_critic_loss
 
 MANY = {"member_steps": 4, "members": 3, "distil_steps": 4, "latent_value_batch": 16}
 

@@ -9,10 +9,10 @@ import torch
 
 from test_joint import SMALL, config, make_store, straight_and_resumed
 from velap.config import ModelConfig
-from velap.data.windows import WindowSampler
+from velap.data.sampling import WindowSampler
 from velap.errors import ConfigError
-from velap.models.latent import LatentModel, Spaces, load_checkpoint
-from velap.models.moments import KEPT_LIMIT, KEPT_SCALE, LIMIT, ColourMoments, MomentEncoder
+from velap.models.encoders.moments import KEPT_LIMIT, KEPT_SCALE, LIMIT, ColourMoments, MomentEncoder
+from velap.models.velap import LatentModel, Spaces, load_checkpoint
 from velap.training.latents import all_moments, encode_all, encode_rows
 from velap.training.loop import Trainer
 from velap.training.slow import LAG, MomentObjective, fit_palette, slow_features

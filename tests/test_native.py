@@ -1,4 +1,4 @@
-"""native.c against the modules whose weights it copies."""
+"""kernels.c against the modules whose weights it copies."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import sys
 import pytest
 import torch
 
-from velap.models import native
-from velap.models.folded import dense_layers, fold
 from velap.models.inference import joined
 from velap.models.networks import MLP, EnsembleMLP
+from velap.native import kernels as native
+from velap.native.folded import dense_layers, fold
 
 needs_compiler = pytest.mark.skipif(native.library() is None, reason="no C compiler here")
 SIZES = [(1, (5,), 1), (7, (128, 128), 32), (3, (40, 33, 64), 2)]
 
 
 def refuse(*parts: torch.Tensor) -> torch.Tensor:
-    raise AssertionError("native.c should have run")
+    raise AssertionError("kernels.c should have run")
 
 
 def stirred(network: torch.nn.Module) -> torch.nn.Module:
@@ -126,7 +126,7 @@ def test_what_native_code_cannot_take_goes_to_torch():
 def test_without_native_code_the_same_comes_out(setting, tmp_path):
     code = """if True:
         import torch
-        from velap.models import native
+        from velap.native import kernels as native
         from velap.models.inference import joined
         from velap.models.networks import MLP
         torch.manual_seed(0)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from velap.bench.records import Record, RecordFile, RunKey, read_records, select
 from velap.errors import RecordError, StorageError
+from velap.evaluation.records import Record, RecordFile, RunKey, read_records, select
 
 KEY = RunKey("Maze", "velap", "default", 0, "velap/Maze-v0", "abc", "c0ffee", "0.1.0")
 
@@ -70,7 +70,7 @@ def test_kill_leaves_whole_records_only(tmp_path: Path) -> None:
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from pathlib import Path
         from test_records import KEY, record
-        from velap.bench.records import RecordFile
+        from velap.evaluation.records import RecordFile
         file = RecordFile(Path({str(path)!r}), KEY)
         for seed in range(10**6):
             file.append(record(seed))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from velap.data.episodes import FrameStore
-from velap.data.windows import WindowSampler
-from velap.train_config import TrainConfig
+from velap.config.training import TrainConfig
+from velap.data.frames import FrameStore
+from velap.data.sampling import WindowSampler
 
 
 def make_store(lengths=(4, 6, 5), rewarded=(1,)) -> FrameStore:

@@ -10,8 +10,9 @@ import pytest
 from rich.console import Console
 
 from test_records import KEY, record
-from velap.bench.records import RecordFile
-from velap.bench.report import (
+from velap.errors import RecordError
+from velap.evaluation.records import RecordFile
+from velap.evaluation.summary import (
     TABLE_END,
     TABLE_START,
     markdown_table,
@@ -22,7 +23,6 @@ from velap.bench.report import (
     wilson,
     write_into,
 )
-from velap.errors import RecordError
 
 
 @pytest.mark.parametrize(("successes", "episodes"), [(99, 100), (0, 100), (10, 10), (3, 7)])

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import tensor
 
-from velap.agents.residuals import Residuals
+from velap.methods.residuals import Residuals
 
 STEP = 1.0
 RIGHT, LEFT = tensor([[1.0]]), tensor([[-1.0]])

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import tensor
 
-from velap.agents.revisits import Revisits
+from velap.methods.revisits import Revisits
 
 DISCOUNT = 0.9
 

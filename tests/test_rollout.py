@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from toy_env import SIDE, ToyEnv, ToyModel, toy_config, toy_env
-from velap.agents.base import Agent, make_agent
-from velap.agents.reactive import RandomAgent
-from velap.bench.rollout import Episode, FrameReader, Rollout, make_envs, succeeded
 from velap.errors import ConfigError, DatasetError
+from velap.evaluation.rollout import Episode, FrameReader, Rollout, make_envs, succeeded
+from velap.methods.base import Agent, make_agent
+from velap.methods.reactive import RandomAgent
 
 
 def toy_agent(method: str = "velap", **planner: object) -> Agent:

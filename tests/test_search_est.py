@@ -20,7 +20,7 @@ from toy_world import (
     row_generators,
     toy_fns,
 )
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.search.est import plan
 from velap.search.sampling import draw_noise
 from velap.search.types import Plan

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from toy_world import DISCOUNT, SPEED, reach, roots, row_generators, toy_fns
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.errors import ConfigError
 from velap.search import est, expansion
 from velap.search.est import plan

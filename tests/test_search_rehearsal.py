@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from toy_world import DISCOUNT, GOAL, SPEED, START, geodesic, roots, row_generators, toy_fns
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.errors import ConfigError
 from velap.search.est import plan
 from velap.search.rehearsal import LOOK_EVERY, rehearse, walk

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.search.sampling import draw_noise, node_distribution, sample_nodes
 
 COUNTS = torch.tensor([[0, 1, 3, 2, 0]])

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from toy_world import DISCOUNT, reach, roots, row_generators, toy_fns
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.search.est import plan
 from velap.search.tree import Candidates, free_slots, insert_, new_tree, take, trace_back, trimmed
 

@@ -14,11 +14,11 @@ import pytest
 import torch
 from rich.console import Console
 
-from velap.bench import benchmarks, speed
-from velap.bench.benchmarks import Measurement, in_turns, peak_memory, synthetic_store
-from velap.bench.speed import BENCHMARKS, Benchmark, run_benchmarks
+from studies import benchmarks, speed
+from studies.benchmarks import Measurement, in_turns, peak_memory, synthetic_store
+from studies.speed import BENCHMARKS, Benchmark, run_benchmarks
 from velap.config import Config, override
-from velap.data.episodes import content_hash, load_store, write_dataset
+from velap.data.frames import content_hash, load_store, write_dataset
 from velap.envs.gl import BACKENDS
 from velap.errors import CheckpointError, ConfigError
 from velap.search.shooting import MPPIConfig

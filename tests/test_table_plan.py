@@ -9,21 +9,21 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from studies import forecast, jobs_view
+from studies.forecast import Forecast
+from studies.inventory import checkpoint_metadata, checkpoint_path
+from studies.jobs import Job, Options, make_plan
+from studies.matrix import Cell, Selection, everything, parse_only
+from studies.paper import METHODS, TABLE_1
+from studies.schedule import Schedule, makespan
+from studies.table_command import TableOne
+from studies.timings import Timing, Timings
 from table_cells import Pretended, fill, inventory
 from velap import cli
-from velap.bench import forecast, jobs_view
-from velap.bench.forecast import Forecast
-from velap.bench.inventory import checkpoint_metadata, checkpoint_path
-from velap.bench.jobs import Job, Options, make_plan
-from velap.bench.matrix import Cell, Selection, everything, parse_only
-from velap.bench.paper import METHODS, TABLE_1
-from velap.bench.schedule import Schedule, makespan
-from velap.bench.table_command import TableOne
-from velap.bench.timings import Timing, Timings
 from velap.config import override
 from velap.errors import ConfigError, UnknownTaskError
 from velap.models.heads import HEADS
-from velap.models.latent import WEIGHTS_SHA256, LatentModel, Spaces, save_checkpoint
+from velap.models.velap import WEIGHTS_SHA256, LatentModel, Spaces, save_checkpoint
 from velap.tasks import make_config
 
 SPIRAL = Cell("SpiralMaze", "velap", "default", 0)

@@ -13,27 +13,27 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from studies import table_command
+from studies.children import Child
+from studies.inventory import Finding
+from studies.jobs import Job, Options
+from studies.jobs_view import JobsView
+from studies.matrix import Cell, parse_only
+from studies.runner import Outcome, Runner
+from studies.schedule import Schedule
+from studies.table_command import Places, TableOne
+from studies.timings import Timings
 from table_cells import fill, inventory
 from velap import cli
-from velap.bench import table_command
-from velap.bench.children import Child
-from velap.bench.inventory import Finding
-from velap.bench.jobs import Job, Options
-from velap.bench.jobs_view import JobsView
-from velap.bench.matrix import Cell, parse_only
-from velap.bench.records import read_records
-from velap.bench.runner import Outcome, Runner
-from velap.bench.schedule import Schedule
-from velap.bench.table_command import Places, TableOne
-from velap.bench.timings import Timings
 from velap.errors import RecordError, VelapError
+from velap.evaluation.records import read_records
 
 RANDOM = Cell("SpiralMaze", "random", "default", 0)
 LOGS = Path("runs/table")
 
 LIGHT = """
 import os, sys, time
-from velap.bench.children import follow_parent
+from studies.children import follow_parent
 follow_parent()
 """
 """Start of a child that loads nothing heavy."""
@@ -141,7 +141,7 @@ def test_ctrl_c_lets_the_children_save_and_ends_them() -> None:
 
 
 def test_children_do_not_outlive_a_killed_parent() -> None:
-    code = ("import sys, time; from pathlib import Path; from velap.bench.children import Child\n"
+    code = ("import sys, time; from pathlib import Path; from studies.children import Child\n"
             f"child = Child(['a', 'wait'], Path('log'), 1, {WORK!r}); print(child.pid, flush=True); time.sleep(60)")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
@@ -176,7 +176,7 @@ def test_the_last_progress_line_counts() -> None:
 
 
 def test_plain_lines_where_the_output_is_no_terminal() -> None:
-    from velap.bench.forecast import Forecast
+    from studies.forecast import Forecast
 
     found = Finding(1, 4, "episodes", False)
     job = Job("evaluate it", "evaluate", RANDOM, (), ("evaluate", "SpiralMaze"), found, wanted=True)
@@ -217,7 +217,7 @@ def test_a_second_table_waits_for_the_jobs_of_a_killed_one_and_then_gives_up(mon
 
 DIES = """
 import os, signal, sys
-from velap.bench import records
+from velap.evaluation import records
 whole = records.os.fsync
 count = 0
 def fsync(descriptor):

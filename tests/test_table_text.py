@@ -9,12 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from table_cells import fill, inventory
-from velap import cli
-from velap.bench.matrix import Cell
-from velap.bench.statistics import mcnemar, mean_and_spread
-from velap.bench.table1 import Results, gather
-from velap.bench.table1_text import (
+from studies.matrix import Cell
+from studies.table1 import Results, gather
+from studies.table1_text import (
     CSV_COLUMNS,
     markdown_cells,
     markdown_comparisons,
@@ -24,8 +21,11 @@ from velap.bench.table1_text import (
     to_csv,
     to_latex,
 )
-from velap.bench.timings import Timing, Timings
+from studies.timings import Timing, Timings
+from table_cells import fill, inventory
+from velap import cli
 from velap.errors import RecordError
+from velap.evaluation.statistics import mcnemar, mean_and_spread
 
 
 @pytest.fixture(autouse=True)

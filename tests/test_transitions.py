@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from test_joint import trainer
-from velap.training.losses import rollout_metric_loss
+from velap.losses import rollout_metric_loss
 from velap.training.transitions import TransitionObjective, step_metric
 
 

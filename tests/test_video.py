@@ -12,12 +12,12 @@ from rich.console import Console
 
 from toy_env import SIDE, ToyModel, toy_env, toy_player
 from toy_world import GOAL, misleading_value
-from velap.bench import demo
-from velap.bench.evaluate import Player
-from velap.bench.figures import LatentMap, can_probe, plan_figure, probe, to_pixels
-from velap.bench.rollout import FrameReader
-from velap.bench.video import CAPTION, HOLD, TILE, VideoRecorder, film
 from velap.errors import CheckpointError, StorageError
+from velap.evaluation.evaluate import Player
+from velap.evaluation.rollout import FrameReader
+from velap.report import demo
+from velap.report.figures import LatentMap, can_probe, plan_figure, probe, to_pixels
+from velap.report.video import CAPTION, HOLD, TILE, VideoRecorder, film
 from velap.search.est import plan
 from velap.search.types import SearchFns
 

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from toy_world import GOAL, HALF_WIDTH, START, TIP, crosses_wall, move, straight_to_goal, toy_fns
-from velap.agents.base import make_agent
-from velap.bench.evaluate import Player
-from velap.bench.records import RunKey
 from velap.config import Config, ModelConfig, override
+from velap.evaluation.evaluate import Player
+from velap.evaluation.records import RunKey
+from velap.methods.base import make_agent
 
 SIDE = 8
 ACTION_SCALE = 2.0

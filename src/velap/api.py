@@ -22,8 +22,8 @@ from velap.storage import run_dir
 from velap.tasks import TASKS, get_task, make_config, task_of
 
 if TYPE_CHECKING:
-    from velap.agents.base import Agent
-    from velap.bench.report import Summary
+    from velap.evaluation.summary import Summary
+    from velap.methods.base import Agent
     from velap.training.steps import Progress
 
 RECORDS = Path("results/records")
@@ -48,7 +48,7 @@ def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwr
         overwrite: collect again and replace a dataset of that id.
     """
     from velap.data import minari_io
-    from velap.data.collect import collect
+    from velap.data.collection import collect
 
     dataset_id = get_task(task).dataset_id
     if minari_io.exists(dataset_id) and not overwrite:
@@ -72,7 +72,7 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         preset: `default` or `paper`.
         seed: decides weights and batches.
         out: run directory; None takes `runs/<task>/<preset>/seed<seed>`.
-        method: one of `velap.agents.base.METHODS`.
+        method: one of `velap.methods.base.METHODS`.
         image_key: key of the image in dict observations.
         device: `auto`, `cpu` or `cuda`.
         resume: go on with the joint run in `out`; a finished one is left as it is. Heads always go on.
@@ -81,7 +81,7 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         command: kept in the checkpoint as its origin.
         on_progress: called after every logged step.
     """
-    from velap.data.episodes import load_store
+    from velap.data.frames import load_store
     from velap.models.heads import HEADS
     from velap.training.heads import check_trainable, learner_config, train_head
     from velap.training.loop import MODEL
@@ -108,7 +108,7 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
 
 def _check_origin(checkpoint: Path, task: str, preset: str, seed: int, changes: Changes) -> None:
     """Raises ConfigError unless a joint checkpoint comes from this task, preset and seed and has the fields of `changes`."""
-    from velap.models.latent import load_checkpoint
+    from velap.models.velap import load_checkpoint
 
     _, config, metadata = load_checkpoint(checkpoint)
     found, asked = (config.task, config.preset, int(metadata["seed"])), (task, preset, seed)
@@ -123,7 +123,7 @@ def _check_origin(checkpoint: Path, task: str, preset: str, seed: int, changes: 
 
 def _is_finished(checkpoint: Path, config: Config, seed: int, dataset_hash: str) -> bool:
     """Whether the checkpoint is there and is what this run would give; a resume then leaves it, and its records, alone."""
-    from velap.models.latent import load_checkpoint
+    from velap.models.velap import load_checkpoint
 
     if not checkpoint.exists():
         return False
@@ -136,13 +136,13 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
 
     Args:
         checkpoint: `model.safetensors` of a run.
-        method: one of `velap.agents.base.METHODS`, such as `velap`, or `td3bc` for π^g alone.
+        method: one of `velap.methods.base.METHODS`, such as `velap`, or `td3bc` for π^g alone.
         device: `auto`, `cpu` or `cuda`.
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
     """
-    from velap.agents.base import make_agent
+    from velap.methods.base import make_agent
     from velap.models.heads import HEADS, head_path, load_head
-    from velap.models.latent import load_checkpoint
+    from velap.models.velap import load_checkpoint
     from velap.training.loop import pick_device
 
     model, config, metadata = load_checkpoint(Path(checkpoint), pick_device(device))
@@ -161,7 +161,7 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
     Args:
         task: task name; with `env`, any label.
         checkpoint: `model.safetensors` of a run; `random` needs none.
-        method: one of `velap.agents.base.METHODS`.
+        method: one of `velap.methods.base.METHODS`.
         episodes: number of episodes.
         first_seed: seed of the first one; test seeds are 0 to 99.
         env: any Gymnasium id instead of the task's own environment.
@@ -170,9 +170,9 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
         device: `auto`, `cpu` or `cuda`.
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
     """
-    from velap.bench.evaluate import Evaluation
-    from velap.bench.evaluate import evaluate as run
-    from velap.bench.report import summarise
+    from velap.evaluation.evaluate import Evaluation
+    from velap.evaluation.evaluate import evaluate as run
+    from velap.evaluation.summary import summarise
 
     what = Evaluation(task, method, Path(checkpoint) if checkpoint is not None else None, env=env, device=device,
                       head=Path(head) if head is not None else None)

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from velap.config import Config, override
-from velap.errors import UnknownTaskError
-from velap.presets import (
+from velap.config.presets import (
     DEFAULT_CONTROLLER,
     DEFAULT_TRAIN,
     ONE_SCENE,
@@ -16,6 +15,7 @@ from velap.presets import (
     PAPER_PLANNER,
     PAPER_TRAIN,
 )
+from velap.errors import UnknownTaskError
 
 PRESETS = ("default", "paper")
 
@@ -179,7 +179,7 @@ TASKS: dict[str, Task] = {
         Task(
             name="SpiralMaze",
             env_id="velap/SpiralMaze-v0",
-            entry_point="velap.envs.block_maze:SpiralMaze",
+            entry_point="velap.envs.mazes.env:SpiralMaze",
             max_steps=300,
             recipe=Recipe(contexts=1, trajectories=1000, max_steps=20, success_percent=0.12),
             overrides={
@@ -205,7 +205,7 @@ TASKS: dict[str, Task] = {
         Task(
             name="ObstacleMaze",
             env_id="velap/ObstacleMaze-v0",
-            entry_point="velap.envs.obstacle:ObstacleMaze",
+            entry_point="velap.envs.mazes.obstacle:ObstacleMaze",
             max_steps=100,
             recipe=Recipe(contexts=250, trajectories=20, max_steps=20, success_percent=0.11),
             # Tables 7-9 give it the values that most tasks have: c1 = 0.01, n_iter 250, n_sim 5, n_replan 15
@@ -235,7 +235,7 @@ TASKS: dict[str, Task] = {
         Task(
             name="WindowClose",
             env_id="velap/WindowClose-v0",
-            entry_point="velap.envs.sawyer_tasks:WindowClose",
+            entry_point="velap.envs.sawyer.tasks:WindowClose",
             max_steps=150,
             recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.48, expert_radius=0.2),
             overrides={
@@ -246,7 +246,7 @@ TASKS: dict[str, Task] = {
         Task(
             name="FaucetClose",
             env_id="velap/FaucetClose-v0",
-            entry_point="velap.envs.sawyer_tasks:FaucetClose",
+            entry_point="velap.envs.sawyer.tasks:FaucetClose",
             max_steps=150,
             recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.31, expert_radius=0.2),
             overrides={
@@ -260,7 +260,7 @@ TASKS: dict[str, Task] = {
         Task(
             name="ButtonWall",
             env_id="velap/ButtonWall-v0",
-            entry_point="velap.envs.sawyer_tasks:ButtonWall",
+            entry_point="velap.envs.sawyer.tasks:ButtonWall",
             max_steps=250,
             recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.16, expert_radius=0.2),
             overrides={
@@ -273,7 +273,7 @@ TASKS: dict[str, Task] = {
         Task(
             name="DrawerButton",
             env_id="velap/DrawerButton-v0",
-            entry_point="velap.envs.sawyer_tasks:DrawerButton",
+            entry_point="velap.envs.sawyer.tasks:DrawerButton",
             max_steps=150,
             recipe=Recipe(contexts=150, trajectories=20, max_steps=50, success_percent=0.16, expert_radius=0.2),
             overrides={

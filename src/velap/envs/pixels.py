@@ -192,7 +192,7 @@ class FrameStack(gymnasium.ObservationWrapper[NDArray[np.uint8], NDArray[np.floa
 
     def observation(self, observation: Frame) -> NDArray[np.uint8]:
         """The stack that ends with this frame."""
-        from velap.data.episodes import stack_indices
+        from velap.data.frames import stack_indices
 
         self._frames.append(observation)
         # a deque that is not full begins with the episode's first frame, a full one never looks further back

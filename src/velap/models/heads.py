@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from velap._version import __version__
 from velap.config import Config, ModelConfig
 from velap.errors import CheckpointError, UnknownTaskError
-from velap.models.generative import ConditionalVAE
-from velap.models.latent import WEIGHTS_SHA256, restore, shared_weights
+from velap.models.action_model import ConditionalVAE
 from velap.models.networks import MLP, EnsembleMLP, Policy
+from velap.models.velap import WEIGHTS_SHA256, restore, shared_weights
 from velap.runs import content_sha256, load_tensors, save_tensors
 
 N_CRITICS = 2

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from velap.models.folded import dense_layers, fold, folded_ensemble, folded_mlp
-from velap.models.native import native_network
 from velap.models.networks import LEAK, MLP, EnsembleMLP
+from velap.native.folded import dense_layers, fold, folded_ensemble, folded_mlp
+from velap.native.kernels import native_network
 
 Forward = Callable[[Tensor], Tensor]
 
@@ -69,7 +69,7 @@ def fast_ensemble(ensemble: EnsembleMLP) -> Forward:
 
 
 def joined(network: MLP | EnsembleMLP, hidden: torch.dtype | None = None) -> Callable[..., Tensor]:
-    """The network on inputs side by side, `[*, W_1], [*, W_2], ...`, by `native.c` where it pays. Copies the weights.
+    """The network on inputs side by side, `[*, W_1], [*, W_2], ...`, by `kernels.c` where it pays. Copies the weights.
 
     Gives `[*, outputs]` of an MLP and `[n, *]` of an ensemble, equal in eval mode, without gradients (and without tanh).
     `hidden` folds normalisation for PyTorch as well, and runs the layers behind the first in that type.
@@ -85,7 +85,7 @@ def joined(network: MLP | EnsembleMLP, hidden: torch.dtype | None = None) -> Cal
 
 
 def _by_torch(network: MLP | EnsembleMLP, hidden: torch.dtype | None) -> Forward:
-    """The network without native.c."""
+    """The network without kernels.c."""
     if isinstance(network, EnsembleMLP):
         return fast_ensemble(network) if hidden is None else folded_ensemble(network, hidden)
     return fast_mlp(network) if hidden is None else folded_mlp(network, hidden)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from velap.config import ModelConfig, Norm
-from velap.train_config import Precision
+from velap.config.training import Precision
 
 LEAK = 0.01
 """Negative slope of the activations (PyTorch's default; the tables say LeakyReLU only)."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.search.expansion import Thresholds, Verdict, expand_, packs, thresholds
 from velap.search.sampling import draw_noise
 from velap.search.tree import new_tree, take, trace_back, trimmed

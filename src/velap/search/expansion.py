@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.errors import ConfigError
 from velap.models.horizon import q_from_steps, steps_from_q
 from velap.search.sampling import Noise, node_distribution, sample_nodes

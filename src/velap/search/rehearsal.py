@@ -14,7 +14,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.errors import ConfigError
 from velap.models.horizon import q_from_steps, steps_from_q
 from velap.search.tree import take, trace_back

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from velap.control_config import PlannerConfig
+from velap.config.planning import PlannerConfig
 from velap.search.types import RowGenerator
 
 

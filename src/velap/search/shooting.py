@@ -13,10 +13,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from velap.config.training import Precision
 from velap.errors import ConfigError
 from velap.search.sampling import normal, uniform
 from velap.search.types import RowGenerator, SearchFns
-from velap.train_config import Precision
 
 
 @dataclass(frozen=True)

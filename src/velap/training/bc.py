@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from velap.errors import DatasetError
+from velap.losses import Info, cloning_error
 from velap.models.heads import PolicyHead
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
-from velap.training.losses import Info, cloning_error
 
 
 @dataclass(frozen=True)

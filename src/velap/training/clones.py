@@ -13,15 +13,15 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from velap.data.windows import WindowSampler
+from velap.config.training import TrainConfig
+from velap.data.sampling import WindowSampler
+from velap.losses import Info, cloning_error
 from velap.models.arrivals import arrivals
 from velap.models.horizon import q_from_steps
-from velap.models.latent import LatentModel
+from velap.models.velap import LatentModel
 from velap.threads import TRANSITIONS_A_THREAD, one_thread
-from velap.train_config import TrainConfig
 from velap.training.capture import adam
 from velap.training.latents import evaluated
-from velap.training.losses import Info, cloning_error
 
 STATES = 3_000
 """States of the data that are looked at; simulations start from the half of them that is farther from the goal by Q^g."""

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from velap.data.windows import WindowSampler
+from velap.data.sampling import WindowSampler
 from velap.models.horizon import steps_from_q
-from velap.models.latent import LatentModel
+from velap.models.velap import LatentModel
 from velap.training.latents import encode_all, encode_rows, evaluated
 
 HORIZONS = (1, 3, 10)

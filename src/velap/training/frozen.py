@@ -17,16 +17,16 @@ import torch
 from torch import Tensor, nn
 
 from velap.config import Config
-from velap.data.episodes import FrameStore
-from velap.data.windows import WindowSampler
+from velap.data.frames import FrameStore
+from velap.data.sampling import WindowSampler
 from velap.errors import CheckpointError, ConfigError
+from velap.losses import Info
 from velap.models.heads import AnyHead
-from velap.models.latent import LatentModel, shared_weights
+from velap.models.velap import LatentModel, shared_weights
 from velap.runs import load_tensors, make_generator, save_tensors
 from velap.training.capture import adam, set_rate
 from velap.training.latents import encode_all, evaluated
 from velap.training.loop import holdout_episodes
-from velap.training.losses import Info
 from velap.training.steps import cosine
 
 LATENTS = "latents.safetensors"

@@ -17,10 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from velap.data.episodes import FrameStore
+from velap.data.frames import FrameStore
 from velap.errors import CheckpointError, ConfigError, DatasetError, TrainingError, UnknownTaskError
 from velap.models.heads import AnyHead, head_path, make_head, save_head
-from velap.models.latent import load_checkpoint, shared_weights
+from velap.models.velap import load_checkpoint, shared_weights
 from velap.runs import MetricsLog, load_tensors, make_generator
 from velap.threads import one_thread
 from velap.training.bc import PAPER_BC, BCConfig, BCLearner, SuccessBCLearner

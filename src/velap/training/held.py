@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from velap.data.windows import WindowSampler
+from velap.data.sampling import WindowSampler
 
 
 class Held(NamedTuple):

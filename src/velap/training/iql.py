@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from velap.losses import Info, cloning_error, polyak, td_target
 from velap.models.heads import IQLHead
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
 from velap.training.latents import evaluated
-from velap.training.losses import Info, cloning_error, polyak, td_target
 from velap.training.steps import cosine
 
 

@@ -16,15 +16,9 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from velap.data.windows import Batch, WindowSampler
-from velap.models.latent import LatentModel
-from velap.models.moments import MomentEncoder
-from velap.threads import TRANSITIONS_A_THREAD, one_thread
-from velap.train_config import TrainConfig
-from velap.training.capture import Captured, adam, set_rate
-from velap.training.clones import Cloning
-from velap.training.latents import commands_before, encode_all, evaluated
-from velap.training.losses import (
+from velap.config.training import TrainConfig
+from velap.data.sampling import Batch, WindowSampler
+from velap.losses import (
     Info,
     action_model_loss,
     critic_error,
@@ -35,6 +29,12 @@ from velap.training.losses import (
     rollout_mse_loss,
     td_target,
 )
+from velap.models.encoders.moments import MomentEncoder
+from velap.models.velap import LatentModel
+from velap.threads import TRANSITIONS_A_THREAD, one_thread
+from velap.training.capture import Captured, adam, set_rate
+from velap.training.clones import Cloning
+from velap.training.latents import commands_before, encode_all, evaluated
 from velap.training.members import Members
 from velap.training.pairs import FrameDecoder, PairObjective
 from velap.training.shifts import shifted

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from velap.data.windows import WindowSampler
-from velap.models.latent import LatentModel
-from velap.models.moments import MomentEncoder
+from velap.data.sampling import WindowSampler
+from velap.models.encoders.moments import MomentEncoder
+from velap.models.velap import LatentModel
 
 
 @contextmanager

@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 
 from velap.config import Config, older_fields
-from velap.data.episodes import FrameStore
-from velap.data.windows import WindowSampler
+from velap.data.frames import FrameStore
+from velap.data.sampling import WindowSampler
 from velap.errors import CheckpointError, ConfigError, DatasetError
-from velap.models.latent import OWN_WEIGHTS, LatentModel, Spaces, load_checkpoint, save_checkpoint
-from velap.models.moments import MomentEncoder
+from velap.models.encoders.moments import MomentEncoder
+from velap.models.velap import OWN_WEIGHTS, LatentModel, Spaces, load_checkpoint, save_checkpoint
 from velap.runs import MetricsLog, make_generator, write_atomic
 from velap.training.diagnostics import diagnose, measure_latents
 from velap.training.joint import JointLearner

@@ -14,13 +14,9 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from velap.data.windows import WindowSampler
-from velap.models.latent import UNREWARDED, LatentModel
-from velap.models.networks import EnsembleMLP
-from velap.train_config import TrainConfig
-from velap.training.capture import adam
-from velap.training.held import hold as held_transitions
-from velap.training.losses import (
+from velap.config.training import TrainConfig
+from velap.data.sampling import WindowSampler
+from velap.losses import (
     Info,
     cloning_error,
     critic_error,
@@ -28,6 +24,10 @@ from velap.training.losses import (
     polyak,
     td_target,
 )
+from velap.models.networks import EnsembleMLP
+from velap.models.velap import UNREWARDED, LatentModel
+from velap.training.capture import adam
+from velap.training.held import hold as held_transitions
 
 CLOSE = 1e-4
 """Squared distance of actions, averaged over A, within which the distance has no edge."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from velap.config.training import TrainConfig
 from velap.data.commands import remembered
-from velap.data.windows import WindowSampler
-from velap.models.latent import LatentModel
+from velap.data.sampling import WindowSampler
+from velap.losses import Info, displacement_loss, reconstruction_loss
 from velap.models.networks import MLP
-from velap.train_config import TrainConfig
-from velap.training.losses import Info, displacement_loss, reconstruction_loss
+from velap.models.velap import LatentModel
 
 
 class FrameDecoder(MLP):

@@ -14,13 +14,13 @@ import torch
 from scipy.linalg import eigh
 from torch import Tensor
 
-from velap.data.windows import WindowSampler
-from velap.models.latent import LatentModel
-from velap.models.moments import MomentEncoder
+from velap.config.training import TrainConfig
+from velap.data.sampling import WindowSampler
+from velap.losses import Info
+from velap.models.encoders.moments import MomentEncoder
 from velap.models.networks import MLP
-from velap.train_config import TrainConfig
+from velap.models.velap import LatentModel
 from velap.training.latents import all_moments
-from velap.training.losses import Info
 from velap.training.pairs import Pairs
 
 PALETTE_FRAMES = 2_000

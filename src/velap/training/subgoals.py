@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from velap.losses import Info, action_model_loss, cloning_error, reparameterise
 from velap.models.heads import SubgoalHead
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
-from velap.training.losses import Info, action_model_loss, cloning_error, reparameterise
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from velap.data.windows import WindowSampler
-from velap.models.latent import LatentModel
-from velap.train_config import TrainConfig
-from velap.training.losses import Info, rollout_metric_loss
+from velap.config.training import TrainConfig
+from velap.data.sampling import WindowSampler
+from velap.losses import Info, rollout_metric_loss
+from velap.models.velap import LatentModel
 
 
 def step_metric(changes: Tensor, ridge: float) -> Tensor:

@@ -1,0 +1,1 @@
+"""The two mazes of a sliding block (C.1)."""

@@ -1,0 +1,1 @@
+"""The four manipulation tasks on Meta-World's physics (C.2)."""

@@ -1,0 +1,1 @@
+"""Playing seeded episodes, their records, and statistics over them."""

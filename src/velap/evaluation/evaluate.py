@@ -1,0 +1,219 @@
+"""Evaluation: checkpoint and method -> seeded episodes -> records -> summary."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+import velap.envs  # noqa: F401 - registers the tasks
+from velap._version import __version__
+from velap.config import Config
+from velap.data.images import IMAGE_SIZE
+from velap.errors import ConfigError, UnknownTaskError
+from velap.evaluation.records import Record, RecordFile, RunKey, select
+from velap.evaluation.rollout import Episode, FrameReader, Observer, Rollout, make_envs
+from velap.methods.base import Agent, Settings, check_method, make_agent, method_hash, method_settings
+from velap.models.heads import HEADS, AnyHead, head_path, load_head
+from velap.models.velap import WEIGHTS_SHA256, LatentModel, load_checkpoint, shared_weights
+from velap.tasks import TASKS, get_task, make_config
+
+BATCH = 10
+"""Environments that run at once. ours: plans are batched over them, more only cost memory."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What to evaluate, and where."""
+
+    task: str
+    """Task name; with `env`, any label."""
+    method: str = "velap"
+    checkpoint: Path | None = None
+    """`model.safetensors` of a run; `random` needs none."""
+    preset: str = "default"
+    """Names the records of a method without a checkpoint; a checkpoint brings its own."""
+    env: str | None = None
+    """Any Gymnasium id, `module:Env-v0` included, instead of the task's own."""
+    image_key: str | None = None
+    """Key of the image in dict observations."""
+    max_steps: int | None = None
+    """Time limit where the environment has none [steps]."""
+    device: str = "auto"
+    changes: dict[str, dict[str, Any]] | None = None
+    """Fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`, or of the method's own settings,
+    `{"mppi": {"temperature": 1.0}}`."""
+    head: Path | None = None
+    """What the method learnt beside the checkpoint; None looks for `<method>.safetensors` in the checkpoint's folder."""
+
+
+@dataclass(frozen=True)
+class Player:
+    """A loaded method: the agent, the environments that it can act in, and what its records say."""
+
+    agent: Agent
+    model: LatentModel | None
+    config: Config
+    key: RunKey
+    make_env: Callable[[], gym.Env[Any, Any]]
+    image_size: int
+    image_key: str | None
+    max_steps: int | None
+
+    def rollout(self, batch: int, observer: Observer | None = None) -> Rollout:
+        """A rollout over `batch` new environments."""
+        envs = make_envs(self.make_env, batch)
+        spec = envs[0].spec
+        limit = spec.max_episode_steps if spec is not None else None
+        if limit is None and self.max_steps is None:
+            raise ConfigError(f"the environment {self.key.env} has no time limit; give one with --max-steps.")
+        reader = FrameReader(envs[0], self.image_size, self.image_key)
+        return Rollout(envs, self.agent, reader, reset_options=reset_options(envs[0]), max_steps=self.max_steps,
+                       observer=observer)
+
+
+def reset_options(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
+    """What makes an environment of ours start as in evaluation; nothing for others."""
+    return {"split": "test"} if env.spec is not None and env.spec.namespace == "velap" else None
+
+
+def load_player(what: Evaluation) -> Player:
+    """Load the checkpoint, make the agent and check that it fits the environment."""
+    task_env = TASKS[what.task].env_id if what.task in TASKS else None
+    env_id = what.env or get_task(what.task).env_id
+    check_method(what.method)
+    loaded = _load_model(what)
+    model, config = loaded.model, loaded.config
+    if what.env is None and config.task != what.task:
+        raise ConfigError(f"{what.checkpoint} was trained on {config.task!r}, not on {what.task!r}; expected "
+                          f"the same. Name the task {config.task!r}, or an environment with --env.")
+    env = make_env(env_id)
+    try:
+        agent = make_agent(what.method, model, config, _checked_actions(env, model), loaded.head, loaded.settings)
+    finally:
+        env.close()
+    key = RunKey(task=what.task if env_id == task_env else env_id, method=what.method, preset=config.preset,
+                 train_seed=loaded.seed, env=env_id,
+                 config_hash=method_hash(config, what.method, loaded.head, loaded.settings), checkpoint=loaded.digest,
+                 code_version=code_version())
+    size = model.spaces.height if model is not None else IMAGE_SIZE
+    return Player(agent, model, config, key, lambda: make_env(env_id), size, what.image_key, what.max_steps)
+
+
+class _Loaded(NamedTuple):
+    """What an evaluation reads from disk, and how the method plans."""
+
+    model: LatentModel | None
+    config: Config
+    seed: int
+    """Training seed."""
+    digest: str
+    """Hash of the joint weights, for other methods than VELAP of those that all share."""
+    head: AnyHead | None = None
+    settings: Settings | None = None
+
+
+def _load_model(what: Evaluation) -> _Loaded:
+    """Checkpoint, head and settings of the method; a bare config for `random`."""
+    from velap.config import override
+    from velap.training.loop import pick_device
+
+    if what.head is not None and what.method not in HEADS:
+        raise ConfigError(f"method {what.method!r} learns no head and got {what.head}; expected one of {', '.join(HEADS)}. "
+                          "Leave --head out, or name that method.")
+    if what.method == "random":
+        return _Loaded(None, make_config(what.task, what.preset), 0, "")
+    if what.checkpoint is None:
+        raise ConfigError(f"method {what.method!r} acts by a trained model and got none; name one with --checkpoint, or "
+                          f"train one with `velap train {what.task}`.")
+    device = pick_device(what.device)
+    model, config, metadata = load_checkpoint(what.checkpoint, device)
+    changes = dict(what.changes or {})
+    settings = method_settings(what.method, changes.pop(what.method, None), config.preset)
+    head = None
+    if what.method in HEADS:
+        head = load_head(what.head or head_path(what.checkpoint, what.method), metadata, device)
+    seed = int(metadata.get("seed", 0))
+    digest = metadata[WEIGHTS_SHA256] if what.method == "velap" else shared_weights(metadata)
+    return _Loaded(model, override(config, **changes), seed, digest, head, settings)
+
+
+def make_env(env_id: str) -> gym.Env[Any, Any]:
+    """The Gymnasium environment of that id; raises UnknownTaskError when Gymnasium cannot make it."""
+    try:
+        return gym.make(env_id)
+    except (gym.error.Error, ImportError) as error:
+        raise UnknownTaskError(f"Gymnasium cannot make {env_id!r}: {error}. Expected a registered id, or `module:Env-v0` "
+                               "with a module that registers it.") from error
+
+
+def _checked_actions(env: gym.Env[Any, Any], model: LatentModel | None) -> gym.spaces.Box:
+    """The environment's action space; raises ConfigError when the model acts in another one."""
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+        raise ConfigError(f"the environment's action space is {space}; expected a one-dimensional Box.")
+    if model is not None:
+        low, high = np.array(model.spaces.action_low), np.array(model.spaces.action_high)
+        if low.shape != space.shape or (low < space.low - 1e-6).any() or (high > space.high + 1e-6).any():
+            raise ConfigError(f"the model acts in {low.tolist()} to {high.tolist()}, the environment takes {space}; "
+                              "expected the same space. Evaluate the checkpoint on the environment that its data come from.")
+    return space
+
+
+def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATCH, fresh: bool = False,
+             observer: Observer | None = None, on_record: Callable[[Record], None] = lambda record: None,
+             player: Player | None = None) -> list[Record]:
+    """Run every seed that is not recorded yet and return the records of all `seeds`, in their order.
+
+    Args:
+        what: method, checkpoint and environment.
+        seeds: episode seeds; test seeds are 0 to 99.
+        records: root of the record files.
+        batch: environments at once.
+        fresh: move an existing record file aside first.
+        observer: sees every state of the episodes that run now, for videos.
+        on_record: called for every record, those found on disk first.
+        player: `load_player(what)` where the caller has it already.
+    """
+    if len(seeds) == 0 or batch < 1:
+        raise ConfigError(f"got {len(seeds)} episodes in batches of {batch}; expected at least one of each.")
+    player = player or load_player(what)
+    with RecordFile(player.key.path(records), player.key, fresh) as file:
+        for record in file.records:
+            if record.episode_seed in seeds:
+                on_record(record)
+        missing = [seed for seed in seeds if seed not in file.done]
+        if missing:
+            for episode in player.rollout(min(batch, len(missing)), observer).run(missing):
+                record = to_record(player.key, episode)
+                file.append(record)
+                on_record(record)
+        return select(file.records, seeds)
+
+
+def to_record(key: RunKey, episode: Episode) -> Record:
+    """The record of an episode, times rounded to microseconds."""
+    return Record(**vars(key), episode_seed=episode.seed, success=episode.success, steps=episode.steps,
+                  truncated=episode.truncated, plan_ms=tuple(round(value, 3) for value in episode.plan_ms))
+
+
+@cache
+def code_version() -> str:
+    """`0.1.0+g1a2b3c4`, with `.dirty` after uncommitted changes; the bare version outside a checkout of velap."""
+    package = Path(__file__).resolve().parents[1]
+    checkout = package.parents[1]
+    if not (checkout / ".git").exists():
+        return __version__
+    git = ["git", "-C", str(checkout)]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+        difference = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "src"], capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        return __version__
+    return f"{__version__}+g{commit.stdout.strip()}{'.dirty' if difference.returncode else ''}"

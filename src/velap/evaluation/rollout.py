@@ -1,0 +1,171 @@
+"""Seeded episodes, several environments at a time.
+
+Episode seed s resets the environment and seeds the agent's row, so an episode does not depend on the row or batch it ran
+in. B environments, N stacked frames, H x W pixels, A action dimensions.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from velap.data.frames import stack_indices
+from velap.data.images import find_image, to_rgb
+from velap.errors import ConfigError
+from velap.methods.base import Agent
+
+
+@dataclass(frozen=True)
+class Episode:
+    """How one episode went."""
+
+    seed: int
+    success: bool
+    steps: int
+    """Environment steps taken [steps]."""
+    truncated: bool
+    """Ended by the time limit without success."""
+    plan_ms: tuple[float, ...]
+    """Planning time of every plan of this row [ms]."""
+
+
+class Observer(Protocol):
+    """Sees every state of every running episode: each before its action, the last one with the episode's outcome."""
+
+    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
+        """Row and seed of the episode, its environment in the state at hand, the agent, the outcome at the end."""
+        ...
+
+
+class FrameReader:
+    """Observations of one environment -> images uint8 [side, side, 3], by the rules that datasets are read by."""
+
+    def __init__(self, env: gym.Env[Any, Any], side: int, image_key: str | None = None) -> None:
+        self._name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+        self._layout = find_image(env.observation_space, image_key, self._name)
+        self._side = side
+
+    def __call__(self, observation: Any) -> NDArray[np.uint8]:
+        """The image of one observation."""
+        for key in self._layout.key:
+            observation = observation[key]
+        image = np.asarray(observation)
+        if image.dtype != np.uint8 or image.shape != self._layout.shape:
+            raise ConfigError(f"{self._name} returned {image.dtype}{list(image.shape)}; its observation space promises "
+                              f"uint8{list(self._layout.shape)}. Mend the environment.")
+        return to_rgb(image[None], self._layout, self._side)[0]
+
+
+def succeeded(reward: float, info: dict[str, Any]) -> bool:
+    """Success of a transition: the environment's own word where `info` has one, else a positive reward."""
+    for key in ("success", "is_success"):
+        if key in info:
+            return bool(info[key])
+    return reward > 0
+
+
+@dataclass
+class _Running:
+    """One row's episode in progress."""
+
+    seed: int
+    frames: list[NDArray[np.uint8]]
+    plan_ms: list[float] = field(default_factory=list)
+
+    @property
+    def steps(self) -> int:
+        return len(self.frames) - 1
+
+    def stacked(self, frame_stack: int) -> NDArray[np.uint8]:
+        """The last N frames [N, H, W, 3], oldest first, the first frame repeated at the start."""
+        rows = stack_indices(np.array(self.steps), np.array(0), frame_stack)
+        return np.stack([self.frames[row] for row in rows])
+
+
+class Rollout:
+    """Runs an agent through episodes in B environments; a row that finishes takes the next seed.
+
+    Once the seeds are used up, finished rows keep showing the agent their last state and their actions go nowhere.
+    """
+
+    def __init__(self, envs: Sequence[gym.Env[Any, Any]], agent: Agent, read: FrameReader, *,
+                 reset_options: dict[str, Any] | None = None, max_steps: int | None = None,
+                 observer: Observer | None = None) -> None:
+        self._envs = list(envs)
+        self._agent = agent
+        self._read = read
+        self._options = reset_options
+        self._max_steps = max_steps
+        self._observer = observer
+
+    def run(self, seeds: Iterable[int]) -> Iterator[Episode]:
+        """Every seed once, yielded in the order of finishing."""
+        queue = deque(seeds)
+        batch = min(len(self._envs), len(queue))
+        rows: list[_Running | None] = [None] * batch
+        stacks: list[NDArray[np.uint8]] = [np.empty(0, np.uint8)] * batch
+        while queue or any(row is not None for row in rows):
+            self._start(rows, queue)
+            for index, row in enumerate(rows):
+                if row is not None:
+                    stacks[index] = row.stacked(self._agent.frame_stack)
+            actions = self._agent.act(np.stack(stacks))
+            for index, row in enumerate(rows):
+                episode = None if row is None else self._step(index, row, actions[index])
+                if episode is not None:
+                    rows[index] = None
+                    yield episode
+
+    def _start(self, rows: list[_Running | None], queue: deque[int]) -> None:
+        """Give every free row the next seed."""
+        mask = np.zeros(len(rows), bool)
+        seeds = np.zeros(len(rows), np.int64)
+        for index, row in enumerate(rows):
+            if row is None and queue:
+                seed = queue.popleft()
+                observation, _ = self._envs[index].reset(seed=seed, options=self._options)
+                rows[index] = _Running(seed, [self._read(observation)])
+                mask[index], seeds[index] = True, seed
+        if mask.any():
+            self._agent.reset(mask, seeds)
+
+    def _step(self, index: int, row: _Running, action: NDArray[np.float32]) -> Episode | None:
+        """One transition of row `index`; the episode if it ended."""
+        env = self._envs[index]
+        if np.isfinite(self._agent.last_plan_ms[index]):
+            row.plan_ms.append(float(self._agent.last_plan_ms[index]))
+        if self._observer is not None:
+            self._observer(index, row.seed, env, self._agent, None)
+        observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
+        row.frames.append(self._read(observation))
+        success = succeeded(float(reward), info)
+        out_of_time = truncated or (self._max_steps is not None and row.steps >= self._max_steps)
+        if not (success or terminated or out_of_time):
+            return None
+        gave_up = bool(out_of_time and not success and not terminated)
+        outcome = Episode(row.seed, success, row.steps, gave_up, tuple(row.plan_ms))
+        if self._observer is not None:
+            self._observer(index, row.seed, env, self._agent, outcome)
+        return outcome
+
+
+def make_envs(make: Callable[[], gym.Env[Any, Any]], count: int) -> list[gym.Env[Any, Any]]:
+    """`count` environments of one kind, with a continuous action space."""
+    envs: list[gym.Env[Any, Any]] = []
+    try:
+        for _ in range(count):
+            envs.append(make())
+            space = envs[-1].action_space
+            if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+                raise ConfigError(f"the environment's action space is {space}; expected a one-dimensional Box.")
+    except BaseException:
+        for env in envs:
+            env.close()
+        raise
+    return envs

@@ -1,0 +1,137 @@
+"""Statistics and tables, computed from episode records and from nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+from scipy.stats import binomtest
+
+from velap.errors import RecordError
+from velap.evaluation.records import Record, read_all
+from velap.runs import write_atomic
+
+TABLE_START = "<!-- velap table: start -->"
+TABLE_END = "<!-- velap table: end -->"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What the records of one run say."""
+
+    task: str
+    method: str
+    preset: str
+    train_seed: int
+    episodes: int
+    successes: int
+    wilson_low: float
+    """Lower end of the 95 % Wilson interval of the success rate [fraction]."""
+    wilson_high: float
+    mean_steps: float
+    """Mean length of all episodes, failed ones included [steps]."""
+    mean_success_steps: float
+    """Mean length of the successful episodes, NaN without any [steps]."""
+    plan_ms_p50: float
+    """Median planning time, NaN where nothing was planned [ms]."""
+    plan_ms_p95: float
+    code_versions: tuple[str, ...]
+
+    @property
+    def success_rate(self) -> float:
+        """Share of successful episodes."""
+        return self.successes / self.episodes
+
+
+def wilson(successes: int, episodes: int) -> tuple[float, float]:
+    """95 % Wilson score interval of a success rate [fraction]."""
+    interval = binomtest(successes, episodes).proportion_ci(confidence_level=0.95, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def summarise(records: Sequence[Record]) -> Summary:
+    """Statistics of one run's records; every record counts."""
+    if not records:
+        raise RecordError("there are no records to summarise; run `velap evaluate` first.")
+    first = records[0]
+    successes = sum(record.success for record in records)
+    low, high = wilson(successes, len(records))
+    plans = np.array([value for record in records for value in record.plan_ms])
+    succeeded = [record.steps for record in records if record.success]
+    return Summary(
+        task=first.task, method=first.method, preset=first.preset, train_seed=first.train_seed,
+        episodes=len(records), successes=successes, wilson_low=low, wilson_high=high,
+        mean_steps=float(np.mean([record.steps for record in records])),
+        mean_success_steps=float(np.mean(succeeded)) if succeeded else math.nan,
+        plan_ms_p50=float(np.percentile(plans, 50)) if len(plans) else math.nan,
+        plan_ms_p95=float(np.percentile(plans, 95)) if len(plans) else math.nan,
+        code_versions=tuple(sorted({record.code_version for record in records})),
+    )
+
+
+COLUMNS = ("task", "method", "preset", "train seed", "episodes", "success [%] (95 % interval)", "steps: solved / all",
+           "plan p50 / p95 [ms]")
+
+
+def cells(summary: Summary) -> tuple[str, ...]:
+    """One row of a table, in the order of `COLUMNS`."""
+    def number(value: float) -> str:
+        return "-" if math.isnan(value) else f"{value:.1f}"
+
+    interval = f"{100 * summary.wilson_low:.1f} to {100 * summary.wilson_high:.1f}"
+    return (summary.task, summary.method, summary.preset, str(summary.train_seed), str(summary.episodes),
+            f"{100 * summary.success_rate:.1f} ({interval})",
+            f"{number(summary.mean_success_steps)} / {number(summary.mean_steps)}",
+            f"{number(summary.plan_ms_p50)} / {number(summary.plan_ms_p95)}")
+
+
+def rich_table(summaries: Iterable[Summary]) -> Table:
+    """The table of several runs for a terminal."""
+    table = Table(*map(escape, COLUMNS))
+    for summary in summaries:
+        table.add_row(*map(escape, cells(summary)))
+    return table
+
+
+def summary_table(summary: Summary) -> Table:
+    """One run for a terminal, a line a number."""
+    table = Table(show_header=False)
+    for name, cell in zip(COLUMNS, cells(summary), strict=True):
+        table.add_row(escape(name), escape(cell))
+    return table
+
+
+def markdown_table(summaries: Iterable[Summary]) -> str:
+    """The table for a document."""
+    return markdown_rows(COLUMNS, (cells(summary) for summary in summaries))
+
+
+def markdown_rows(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [columns, ("---",) * len(columns), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def summarise_all(root: Path) -> list[Summary]:
+    """A summary of every record file below `root`, sorted by task, method, preset and training seed."""
+    files = {path: records for path, records in read_all(root).items() if records}
+    if not files:
+        raise RecordError(f"there are no records below {root}; run `velap evaluate TASK --checkpoint F` first.")
+    summaries = [summarise(records) for records in files.values()]
+    return sorted(summaries, key=lambda summary: (summary.task, summary.method, summary.preset, summary.train_seed))
+
+
+def write_into(document: Path, table: str) -> None:
+    """Replace what stands between the two table marks of `document`."""
+    text = document.read_text()
+    if text.count(TABLE_START) != 1 or text.count(TABLE_END) != 1:
+        raise RecordError(f"{document} has no place for the table; put the lines {TABLE_START!r} and {TABLE_END!r} where it "
+                          "belongs.")
+    before, rest = text.split(TABLE_START)
+    after = rest.split(TABLE_END)[1]
+    write_atomic(document, f"{before}{TABLE_START}\n{table}\n{TABLE_END}{after}".encode())

@@ -1,0 +1,1 @@
+"""Encoders φ: frames to latents."""

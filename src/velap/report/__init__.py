@@ -1,0 +1,1 @@
+"""Pictures, videos and diagnoses of trained models."""

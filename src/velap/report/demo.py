@@ -1,0 +1,94 @@
+"""`velap demo`: test episodes solved live with the released checkpoint, a video of them and a picture of the first plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from velap.errors import CheckpointError
+from velap.evaluation.console import EpisodeView
+from velap.evaluation.evaluate import Evaluation, Player, load_player, to_record
+from velap.evaluation.records import Record
+from velap.evaluation.rollout import Episode
+from velap.evaluation.summary import Summary, summarise, summary_table
+from velap.methods.base import Agent
+from velap.methods.velap import VelapAgent
+from velap.report.figures import LatentMap, plan_figure
+from velap.report.video import VideoRecorder, latent_map_of, picture
+from velap.search.types import Plan
+from velap.tasks import get_task
+
+PICTURE = 512
+"""Side of the frame in the picture [px]."""
+
+
+class FirstPlan:
+    """An observer that keeps the first plan of episode `seed` and the frame that it was made from."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._kept: tuple[NDArray[np.uint8], Plan, int] | None = None
+
+    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
+        """Keep the plan once, as soon as it is there."""
+        if self._kept is None and seed == self._seed and isinstance(agent, VelapAgent) and agent.last_plan is not None:
+            rows = np.flatnonzero(agent.last_plan_rows == row)
+            if len(rows):
+                self._kept = picture(env, PICTURE), agent.last_plan, int(rows[0])
+
+    def draw(self, latent_map: LatentMap, path: Path) -> bool:
+        """Draw it into `path`; False where the episode had no plan."""
+        if self._kept is None:
+            return False
+        frame, plan, row = self._kept
+        plan_figure(path, frame, plan, row, latent_map, f"VELAP's first plan of episode {self._seed}")
+        return True
+
+
+def released_checkpoint(task: str) -> Path:
+    """`checkpoints/<task>.safetensors` of this folder, or of the checkout that velap is installed from."""
+    name = Path("checkpoints") / f"{get_task(task).name}.safetensors"
+    places = [name, Path(__file__).resolve().parents[3] / name]
+    for path in places:
+        if path.is_file():
+            return path
+    raise CheckpointError(f"no released checkpoint of {task}: neither {places[0]} nor {places[1]} is there. Train one with "
+                          f"`velap run {task}`, or name one with --checkpoint.")
+
+
+def run_demo(console: Console, task: str, checkpoint: Path | None, episodes: int, out: Path, device: str) -> Summary:
+    """Play test episodes 0 ... `episodes` - 1 at once; writes `episodes.mp4` and `plan.png` into `out`."""
+    path = checkpoint or released_checkpoint(task)
+    player = load_player(Evaluation(task, checkpoint=path, device=device))
+    console.print(f"{task} with {path}: {episodes} test episodes at once", markup=False)
+    with console.status("looking at the world through the encoder"):
+        latent_map = latent_map_of(player)
+    first_plan = FirstPlan(0)
+    summary = summarise(_play(console, player, episodes, out / "episodes.mp4", latent_map, first_plan))
+    console.print(summary_table(summary))
+    console.print(f"video {out / 'episodes.mp4'}", markup=False)
+    if latent_map is not None and first_plan.draw(latent_map, out / "plan.png"):
+        console.print(f"picture {out / 'plan.png'}", markup=False)
+    return summary
+
+
+def _play(console: Console, player: Player, episodes: int, video: Path, latent_map: LatentMap | None,
+          first_plan: FirstPlan) -> list[Record]:
+    """Run and film the episodes, showing each as it ends."""
+    records: list[Record] = []
+    with EpisodeView(console, "demo", episodes) as view, VideoRecorder(video, episodes, latent_map) as recorder:
+
+        def observe(row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
+            first_plan(row, seed, env, agent, outcome)
+            recorder(row, seed, env, agent, outcome)
+            view.step(row)
+
+        for episode in player.rollout(episodes, observe).run(range(episodes)):
+            records.append(to_record(player.key, episode))
+            view(records[-1])
+    return records

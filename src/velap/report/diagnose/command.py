@@ -1,0 +1,272 @@
+"""`velap diagnose`: what a model has learnt and where its episodes fail, in pictures and a page of text."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+
+from velap.config import Config, override
+from velap.data import minari_io
+from velap.errors import ConfigError, DatasetError
+from velap.evaluation.evaluate import Evaluation, Player, load_player
+from velap.evaluation.rollout import FrameReader
+from velap.models.velap import LatentModel, load_checkpoint
+from velap.report.demo import released_checkpoint
+from velap.report.diagnose import figures
+from velap.report.diagnose.failures import Failures, watch
+from velap.report.diagnose.model import (
+    ActionValues,
+    Album,
+    Pairs,
+    Recorded,
+    RolloutError,
+    ValueCurve,
+    action_values,
+    album_of,
+    encode_states,
+    open_recorded,
+    other_pairs,
+    rewarded_curves,
+    rollout_error,
+)
+from velap.report.diagnose.plans import Starts, Trees, diagnose_trees
+from velap.report.diagnose.text import findings, page
+from velap.report.diagnose.world import Scene, expert_curves, first_states, has_layout, look_at_scene, scenery
+from velap.report.figures import can_probe
+from velap.runs import write_atomic
+from velap.tasks import TASKS, get_task, task_of
+from velap.training.diagnostics import horizons
+from velap.training.loop import pick_device
+
+FIRST_SEED = 1000
+"""Test episodes, 0 to 99, are for results alone."""
+TEST_SEEDS = range(100)
+STARTS = 5
+"""Plans. ours."""
+SCENES = 3
+"""Scenes and expert's episodes. ours."""
+LONGEST = 20
+"""Rollouts are followed for at most so many steps [steps]. ours."""
+PAGE = "report.md"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to diagnose."""
+
+    task: str | None = None
+    """Task name; any label with `dataset` or `env`, or None: the dataset's task."""
+    checkpoint: Path | None = None
+    """None takes the task's released one."""
+    dataset: str | None = None
+    """Minari id; None takes the task's own."""
+    out: Path | None = None
+    """Folder of the report; None takes `runs/diagnosis/<task>`."""
+    episodes: int = 10
+    first_seed: int = FIRST_SEED
+    device: str = "auto"
+    changes: Mapping[str, dict[str, Any]] | None = None
+    """Config fields to replace."""
+    env: str | None = None
+    """Gymnasium id instead of the task's own."""
+    image_key: str | None = None
+    max_steps: int | None = None
+    """Time limit where the environment has none [steps]."""
+    command: str = "velap diagnose"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All results; text and pictures read it."""
+
+    subject: str
+    command: str
+    origin: str
+    """Sentences about what was looked at."""
+    left_out: tuple[str, ...]
+    discount: float
+    """γ."""
+    arrived_steps: float
+    """Q^l's steps that count as arrived, `controller.waypoint_exponent` [steps]."""
+    simulated: int
+    """Simulated steps of an expansion, `planner.n_sim` [steps]."""
+    rollout: RolloutError
+    pairs: tuple[Pairs, ...]
+    curves: tuple[ValueCurve, ...]
+    actions: ActionValues
+    scenes: tuple[Scene, ...]
+    trees: Trees
+    failures: Failures | None
+    pictures: tuple[str, ...]
+    """Names of the pictures, in the order of the page; the last one belongs to its end."""
+
+
+class _Subject(NamedTuple):
+    """What a request means."""
+
+    name: str
+    checkpoint: Path
+    dataset_id: str
+    evaluation: Evaluation | None
+    """None without an environment."""
+
+
+def resolve(request: Request) -> _Subject:
+    """Find checkpoint, dataset and environment; raises what says how to get them."""
+    task, env = request.task, request.env
+    if task is None:
+        if request.dataset is None:
+            raise ConfigError("got neither a task nor a dataset; expected `velap diagnose TASK`, or `velap diagnose "
+                              "--dataset ID --checkpoint FILE`.")
+        task = task_of(request.dataset)
+    if request.dataset is None:
+        get_task(task)
+    if env is not None or task in TASKS:
+        _check_seeds(request, task in TASKS and env is None)
+    checkpoint = request.checkpoint
+    if checkpoint is None:
+        if task not in TASKS:
+            raise ConfigError(f"got no checkpoint for {task!r}; expected --checkpoint with the `model.safetensors` of a "
+                              f"run. Make one with `velap train --dataset {request.dataset}`.")
+        checkpoint = released_checkpoint(task)
+    dataset_id = request.dataset or TASKS[task].dataset_id
+    if task in TASKS and dataset_id == TASKS[task].dataset_id and not minari_io.exists(dataset_id):
+        raise DatasetError(f"the dataset {dataset_id} is not on this machine; a diagnosis compares the model with recorded "
+                           f"episodes. Make it with `velap collect {task}`, or name another one with --dataset.")
+    evaluation = None
+    if env is not None or task in TASKS:
+        changes = dict(request.changes or {})
+        evaluation = Evaluation(task, "velap", checkpoint, env=env, image_key=request.image_key,
+                                max_steps=request.max_steps, device=request.device, changes=changes)
+    return _Subject(task, checkpoint, dataset_id, evaluation)
+
+
+def _check_seeds(request: Request, ours: bool) -> None:
+    """Raises ConfigError for no episodes, or for test episodes of our tasks."""
+    if request.episodes < 1:
+        raise ConfigError(f"got {request.episodes} episodes; expected at least one.")
+    last = request.first_seed + max(request.episodes, STARTS) - 1
+    if request.first_seed < 0 or (ours and request.first_seed in TEST_SEEDS):
+        raise ConfigError(f"got seeds {request.first_seed} to {last}; seeds {TEST_SEEDS.start} to {TEST_SEEDS.stop - 1} are "
+                          f"the test episodes, on which nothing is tuned. Take others, such as --first-seed {FIRST_SEED}.")
+
+
+def run_diagnose(console: Console, request: Request) -> Diagnosis:
+    """Measure, draw and write; prints what was found and where it lies."""
+    began = time.monotonic()
+    subject = resolve(request)
+    model, config, metadata = load_checkpoint(subject.checkpoint, pick_device(request.device))
+    config = override(config, **dict(request.changes or {}))
+    player = None if subject.evaluation is None else load_player(subject.evaluation)
+    with console.status(f"reading {subject.dataset_id}"):
+        recorded = open_recorded(subject.dataset_id, request.image_key, model, config, metadata)
+    out = request.out or Path("runs/diagnosis") / subject.name.replace("/", "_")
+    diagnosis = _measure(console, request, subject, model, config, recorded, player)
+    with console.status("drawing"):
+        _draw(diagnosis, out)
+    write_atomic(out / PAGE, page(diagnosis).encode())
+    for each in findings(diagnosis):
+        console.print(f"{each.mark:>4}  {each.title}: {each.numbers}", markup=False, soft_wrap=True)
+    console.print(f"report {out / PAGE}, {time.monotonic() - began:.0f} s", markup=False, soft_wrap=True)
+    return diagnosis
+
+
+def _measure(console: Console, request: Request, subject: _Subject, model: LatentModel, config: Config, recorded: Recorded,
+             player: Player | None) -> Diagnosis:
+    """All results."""
+    rng = np.random.default_rng(0)
+    longest = int(recorded.store.episode_length[recorded.episodes].max())
+    with console.status("rollouts and distances on recorded episodes"):
+        rollout = rollout_error(horizons(model, recorded.sampler, recorded.spans, range(1, min(LONGEST, longest) + 1), None))
+        pairs = other_pairs(model, recorded, config.train.group_reach, rng)
+        album, held_out = album_of(model, recorded, rng), encode_states(model, recorded.sampler, recorded.rows)
+    world = _World() if player is None else _look_at_world(console, request, model, player)
+    starts = world.starts or _recorded_starts(recorded)
+    with console.status("plans"):
+        seeds = range(request.first_seed, request.first_seed + len(starts.labels))
+        trees = diagnose_trees(model, config, starts, seeds, album, world.scenery, held_out, rollout.one_step)
+    curves = world.curves or tuple(rewarded_curves(model, recorded))
+    failures = None
+    if player is not None:
+        with console.status(f"{request.episodes} episodes at once"):
+            failures = watch(player, range(request.first_seed, request.first_seed + request.episodes), recorded.fastest)
+    pictures = ["model.png", *(["values.png"] if curves else []), *(["scenes.png"] if world.scenes else []), "plan.png"]
+    return Diagnosis(
+        subject.name, request.command, _origin(subject, recorded, config), _left_out(world, player),
+        model.discount, config.controller.waypoint_exponent, config.planner.n_sim, rollout, tuple(pairs), curves,
+        action_values(model, recorded, held_out), world.scenes, trees, failures,
+        (*pictures, *(["failure.png"] if failures is not None else [])))
+
+
+class _World(NamedTuple):
+    """What an environment shows."""
+
+    starts: Starts | None = None
+    curves: tuple[ValueCurve, ...] = ()
+    scenes: tuple[Scene, ...] = ()
+    scenery: Album | None = None
+
+
+def _look_at_world(console: Console, request: Request, model: LatentModel, player: Player) -> _World:
+    """Starts, expert's episodes and scenes of the seeds from the first on."""
+    env: gym.Env[Any, Any] = player.make_env()
+    seeds, frame_stack = range(request.first_seed, request.first_seed + STARTS), player.config.model.frame_stack
+    try:
+        read = FrameReader(env, player.image_size, player.image_key)
+        with console.status("the expert's episodes"):
+            curves = expert_curves(model, env, frame_stack, seeds[:SCENES])
+        scenes, around = [], None
+        with console.status("test scenes"):
+            if has_layout(env):
+                scenes = [look_at_scene(model, env, read, frame_stack, seed) for seed in seeds[:SCENES]]
+            if can_probe(env):
+                around = scenery(model, env, read, frame_stack, seeds[0])
+        return _World(first_states(player, env, seeds), tuple(curves), tuple(scenes), around)
+    finally:
+        env.close()
+
+
+def _recorded_starts(recorded: Recorded) -> Starts:
+    """First states of the episodes that are looked at."""
+    picked = recorded.episodes[:STARTS]
+    rows = recorded.sampler.starts.new_tensor(recorded.store.episode_start[picked])
+    return Starts(tuple(f"episode {episode} of the data" for episode in picked), recorded.sampler.stacks(rows).cpu().numpy())
+
+
+def _origin(subject: _Subject, recorded: Recorded, config: Config) -> str:
+    """What was looked at."""
+    kind = "were not trained on" if recorded.held_out else "were trained on: the dataset is too small to keep any out"
+    return (f"Checkpoint `{subject.checkpoint.name}` (task {config.task}, preset {config.preset}), dataset "
+            f"{subject.dataset_id} with {recorded.store.n_episodes} episodes; the {len(recorded.episodes)} that are looked "
+            f"at {kind}.")
+
+
+def _left_out(world: _World, player: Player | None) -> tuple[str, ...]:
+    """What could not be measured, and why."""
+    if player is None:
+        return ("true distances, the expert's path and episodes: there is no environment (--env names one). Plans start "
+                "from recorded states, Q^g is shown along rewarded recorded episodes.",)
+    missing = [] if world.scenes else ["true distances in test scenes: only the block mazes tell them."]
+    if not world.curves:
+        missing.append("the expert's path: the environment has no scripted expert that succeeds. Q^g is shown along "
+                       "rewarded recorded episodes.")
+    return tuple(missing)
+
+
+def _draw(diagnosis: Diagnosis, out: Path) -> None:
+    """Every picture that the page names."""
+    figures.model_figure(out / "model.png", diagnosis.rollout, diagnosis.pairs)
+    if diagnosis.curves:
+        figures.values_figure(out / "values.png", diagnosis.curves)
+    if diagnosis.scenes:
+        figures.scenes_figure(out / "scenes.png", diagnosis.scenes)
+    figures.strip_figure(out / "plan.png", diagnosis.trees.strip)
+    if diagnosis.failures is not None:
+        figures.strip_figure(out / "failure.png", diagnosis.failures.strip)

@@ -1,0 +1,313 @@
+"""What `velap diagnose` measures on recorded episodes: dynamics, distances by Q^l and values by Q^g; no environment.
+
+F frames of the dataset, S pairs of states, T transitions of an episode, D latent dimensions, P frames of an album,
+N stacked frames, H x W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
+from torch import Tensor
+
+from velap.config import Config
+from velap.data.frames import FrameStore, load_positions, load_store
+from velap.data.sampling import WindowSampler
+from velap.errors import ConfigError
+from velap.models.horizon import q_from_steps, steps_from_q
+from velap.models.inference import nearest_row
+from velap.models.velap import LatentModel
+from velap.training.diagnostics import Horizon
+from velap.training.latents import encode_rows
+from velap.training.loop import holdout_episodes
+
+PAIRS = 1000
+"""Pairs of states of other trajectories, of each kind. ours."""
+ALBUM = 4000
+"""Frames of the dataset that a latent is compared with. ours: a few seconds of encoding."""
+FEW = 16
+"""Episodes that are looked at where none was held out. ours, as `holdout_episodes`."""
+REWARDED = 3
+"""Rewarded episodes that Q^g is drawn along. ours."""
+LAST = 20
+"""Steps before the reward over which Q^g has to rise; farther away it may be flat, a tree searches there [steps]. ours."""
+LED = 5
+"""The value of an action is compared with that of the state so many steps later [steps]. ours: recorded actions last some
+steps, and one step is hardly more than the noise of a value."""
+FEWEST = 50
+"""Transitions that a correlation is taken over at least. ours."""
+APART = 2.0
+"""Two states are apart where the agent needs more than this times the steps that count as arrived. ours."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A dataset, and the episodes of it that are looked at."""
+
+    store: FrameStore
+    sampler: WindowSampler
+    episodes: NDArray[np.int64]
+    """[E] episodes that are looked at."""
+    held_out: bool
+    """None of them was trained on."""
+    positions: NDArray[np.float32] | None
+    """[F, 2 or 3] agent's position at each frame [m], where the dataset keeps it."""
+
+    @property
+    def spans(self) -> list[tuple[int, int]]:
+        """First and last row of the episodes."""
+        starts, lengths = self.store.episode_start[self.episodes], self.store.episode_length[self.episodes]
+        return [(int(start), int(start + length)) for start, length in zip(starts, lengths, strict=True)]
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Rows of those episodes, one after the other."""
+        return np.concatenate([np.arange(first, last + 1) for first, last in self.spans])
+
+    @property
+    def fastest(self) -> float | None:
+        """The agent's way in its fastest recorded steps [m/step]; None where positions are unknown."""
+        if self.positions is None:
+            return None
+        moving = self.sampler.transitions.cpu().numpy()
+        ways = np.linalg.norm(self.positions[moving + 1].astype(np.float64) - self.positions[moving], axis=-1)
+        return float(np.quantile(ways, 0.999))
+
+
+def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, config: Config,
+                  metadata: Mapping[str, str]) -> Recorded:
+    """Read a dataset for a model whose checkpoint has `metadata`; raises ConfigError where its actions do not fit."""
+    store = load_store(dataset_id, image_key, image_size=model.spaces.height)
+    if len(store.action_low) != model.action_dim:
+        raise ConfigError(f"{dataset_id} has actions of {len(store.action_low)} entries, the checkpoint acts by "
+                          f"{model.action_dim}; expected the same. Name the dataset that it was trained on with --dataset.")
+    kept = holdout_episodes(store, config.train.holdout_episodes, int(metadata.get("seed", 0)))
+    held_out = len(kept) > 0 or metadata.get("dataset_hash") != store.content_hash
+    device = next(model.parameters()).device
+    sampler = WindowSampler(store, config.train, config.model.frame_stack, device, kept)
+    positions = load_positions(dataset_id)
+    known = positions is not None and len(positions) == len(store.frames)
+    return Recorded(store, sampler, kept if len(kept) else np.arange(min(FEW, store.n_episodes)), held_out,
+                    positions if known else None)
+
+
+@torch.inference_mode()
+def encode_states(model: LatentModel, sampler: WindowSampler, rows: NDArray[np.int64], chunk: int = 512) -> Tensor:
+    """Latents [R, D] of the states at rows [R]."""
+    return encode_rows(model, sampler, torch.from_numpy(rows).to(sampler.device), chunk).float()
+
+
+def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
+    """Spearman's rho, NaN where one of them does not vary."""
+    if len(first) < 2 or np.ptp(first) == 0 or np.ptp(second) == 0:
+        return float("nan")
+    return float(spearmanr(first, second).statistic)
+
+
+@dataclass(frozen=True)
+class RolloutError:
+    """How far h leads from the truth, against how far the truth moves: medians and quartiles over S pairs."""
+
+    lengths: NDArray[np.int64]
+    """[K] simulated steps [steps]."""
+    error: NDArray[np.float64]
+    """[3, K] lower quartile, median, upper quartile [one-step lengths]."""
+    moved: NDArray[np.float64]
+    """[3, K] the same of the true displacement [one-step lengths]."""
+    local_steps: NDArray[np.float64]
+    """[3, K] the same of log_γ Q_min from the start to the truth [steps]."""
+    one_step: float
+    """Mean distance of subsequent encodings [latent distance]."""
+
+    def at(self, steps: int) -> int:
+        """Index of the length nearest to `steps`."""
+        return int(np.abs(self.lengths - steps).argmin())
+
+
+def rollout_error(horizons: Sequence[Horizon]) -> RolloutError:
+    """Sum up the pairs of every length; the first has length 1."""
+    one_step = horizons[0].moved.mean().item()
+
+    def quartiles(values: Sequence[Tensor], unit: float) -> NDArray[np.float64]:
+        return np.stack([np.quantile(each.double().cpu().numpy() / unit, (0.25, 0.5, 0.75)) for each in values], 1)
+
+    return RolloutError(np.array([each.length for each in horizons]), quartiles([each.error for each in horizons], one_step),
+                        quartiles([each.moved for each in horizons], one_step),
+                        quartiles([each.local_steps for each in horizons], 1.0), one_step)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """States of other trajectories as Q^l sees them from states of the episodes that are looked at."""
+
+    name: str
+    local_steps: NDArray[np.float64]
+    """[S] log_γ Q_min [steps]."""
+    least_steps: NDArray[np.float64] | None
+    """[S] way between the agent's positions at its top speed, a lower bound [steps]; None where positions are unknown."""
+
+    def arrived(self, limit: float) -> float:
+        """Share of the pairs that Q^l calls at most `limit` [steps] apart."""
+        return float((self.local_steps <= limit).mean())
+
+    def aliased(self, limit: float) -> float | None:
+        """Share of the pairs truly apart that Q^l calls at most `limit` [steps] apart; None where no pair is known to be."""
+        if self.least_steps is None:
+            return None
+        apart = self.least_steps > APART * limit
+        return float((self.local_steps[apart] <= limit).mean()) if apart.any() else None
+
+
+def other_pairs(model: LatentModel, recorded: Recorded, reach: int, rng: np.random.Generator,
+                count: int = PAIRS) -> list[Pairs]:
+    """Pairs with episodes recorded at most `reach` [episodes] before or after, which tend to share a scene, and with the
+    others."""
+    store = recorded.store
+    start = rng.choice(recorded.rows, count)
+    episode = store.episode_of[start]
+    everything = np.arange(store.n_episodes)
+    latents, found = encode_states(model, recorded.sampler, start), []
+    for name, near in (("neighbouring episodes", True), ("far episodes", False)):
+        choices = []
+        for number in range(count):
+            distance = np.abs(everything - episode[number])
+            pool = everything[((distance <= reach) & (distance > 0)) if near else distance > reach]
+            choices.append(rng.choice(pool) if len(pool) else -1)
+        chosen = np.array(choices)
+        if (chosen < 0).any():
+            continue
+        goal = store.episode_start[chosen] + rng.integers(0, store.episode_length[chosen] + 1)
+        found.append(Pairs(name, local_steps(model, latents, encode_states(model, recorded.sampler, goal)),
+                           _least_steps(recorded, start, goal)))
+    return found
+
+
+def local_steps(model: LatentModel, start: Tensor, goal: Tensor) -> NDArray[np.float64]:
+    """log_γ Q_min between latents [S, D] [steps]."""
+    with torch.inference_mode():
+        return steps_from_q(model.reach(start, goal)[0].double(), model.discount).cpu().numpy()
+
+
+def _least_steps(recorded: Recorded, start: NDArray[np.int64], goal: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Distance of the agent's positions by the fastest of its recorded steps [steps]."""
+    places, fastest = recorded.positions, recorded.fastest
+    if places is None or not fastest:
+        return None
+    return np.linalg.norm(places[goal].astype(np.float64) - places[start], axis=-1) / fastest
+
+
+@dataclass(frozen=True)
+class ValueCurve:
+    """Q^g along an episode that ends in the reward."""
+
+    label: str
+    values: NDArray[np.float64]
+    """[T + 1] [Q-value]; the reward is that of the last transition."""
+    discount: float
+
+    @property
+    def ideal(self) -> NDArray[np.float64]:
+        """[T] γ^(steps before the rewarded one): what following this episode is worth."""
+        return np.asarray(q_from_steps(1.0, self.discount)) ** np.arange(len(self.values) - 2, -1, -1)
+
+    @property
+    def rho(self) -> float:
+        """Spearman's rho of value and time over the last `LAST` steps up to the reward."""
+        last = self.values[:-1][-LAST:]
+        return rank_correlation(last, np.arange(float(len(last))))
+
+    @property
+    def steps_error(self) -> float:
+        """Median of how far log_γ Q^g is off the steps that are left [steps]."""
+        read = steps_from_q(torch.from_numpy(self.values[:-1]), self.discount).numpy()
+        return float(np.median(np.abs(read - np.arange(len(read) - 1, -1, -1))))
+
+
+def value_curve(model: LatentModel, label: str, latents: Tensor) -> ValueCurve:
+    """Q^g along the latents [T + 1, D] of an episode."""
+    with torch.inference_mode():
+        return ValueCurve(label, model.value(latents).double().cpu().numpy(), model.discount)
+
+
+def rewarded_curves(model: LatentModel, recorded: Recorded, count: int = REWARDED) -> list[ValueCurve]:
+    """Q^g along the longest rewarded episodes of the dataset; most of them were trained on."""
+    store = recorded.store
+    rewarded = np.flatnonzero(np.bincount(store.episode_of, weights=store.rewards) > 0)
+    longest = rewarded[np.argsort(-store.episode_length[rewarded], kind="stable")][:count]
+    curves = []
+    for episode in longest:
+        first = int(store.episode_start[episode])
+        rows = np.arange(first, first + int(store.episode_length[episode]) + 1)
+        curves.append(value_curve(model, f"episode {episode} of the data", encode_states(model, recorded.sampler, rows)))
+    return curves
+
+
+@dataclass(frozen=True)
+class ActionValues:
+    """What Q^g promises of recorded actions, against what has come of them some steps later; S transitions.
+
+    π^g climbs Q^g over actions, so this tells whether it can know where to go; values along episodes do not, as they may be
+    right at states and blind to actions.
+    """
+
+    away: NDArray[np.float64]
+    """[S] log_γ Q^g(z, π^g(z)) before the action [steps]."""
+    promised: NDArray[np.float64]
+    """[S] steps that the recorded action is better than π^g's by Q^g [steps]."""
+    gained: NDArray[np.float64]
+    """[S] steps that Q^g sees the goal come nearer over the next `LED` [steps]."""
+
+    def rho(self, far: bool) -> float:
+        """Spearman's rho of promise and gain over the farther or the nearer half; NaN where there are too few."""
+        half = (self.away > np.median(self.away)) == far if len(self.away) else np.zeros(0, bool)
+        if half.sum() < FEWEST:
+            return float("nan")
+        return rank_correlation(self.promised[half], self.gained[half])
+
+
+@torch.inference_mode()
+def action_values(model: LatentModel, recorded: Recorded, latents: Tensor) -> ActionValues:
+    """Judge the recorded actions of the episodes that are looked at; latents [R, D] of `recorded.rows`."""
+    actions = recorded.sampler.actions[torch.from_numpy(recorded.rows).to(recorded.sampler.device)]
+    values, taken = (steps_from_q(q, model.discount).double().cpu().numpy()
+                     for q in (model.value(latents), model.global_q(latents, actions)))
+    lengths = [last - first + 1 for first, last in recorded.spans]
+    begins = np.cumsum([0, *lengths[:-1]])
+    now = np.concatenate([begin + np.arange(max(length - LED, 0)) for begin, length in zip(begins, lengths, strict=True)])
+    return ActionValues(values[now], values[now] - taken[now], values[now] - values[now + LED])
+
+
+@dataclass(frozen=True)
+class Album:
+    """Real states: what they look like and where they are in the latent space."""
+
+    source: str
+    latents: Tensor
+    """[P, D]."""
+    frames: NDArray[np.uint8]
+    """[P, H, W, 3]."""
+
+    def nearest(self, latents: Tensor) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Frames [*, H, W, 3] of the states nearest to latents [*, D], and how far they are [*] [latent distance]."""
+        found = nearest_row(self.latents)(latents)
+        distance = (self.latents[found] - latents).norm(dim=-1)
+        return self.frames[found.cpu().numpy()], distance.double().cpu().numpy()
+
+    def spacing(self) -> float:
+        """Mean distance of a state to the nearest other one [latent distance]."""
+        distances = torch.cdist(self.latents, self.latents)
+        return float(distances.fill_diagonal_(torch.inf).amin(1).mean())
+
+
+def album_of(model: LatentModel, recorded: Recorded, rng: np.random.Generator, size: int = ALBUM) -> Album:
+    """States of the dataset, drawn uniformly from the episodes that are not looked at where there are others."""
+    rows = np.setdiff1d(np.arange(len(recorded.store.frames)), recorded.rows if recorded.held_out else [])
+    if len(rows) == 0:
+        rows = recorded.rows
+    rows = np.sort(rng.choice(rows, min(size, len(rows)), replace=False))
+    return Album("the dataset", encode_states(model, recorded.sampler, rows), recorded.store.frames[rows])

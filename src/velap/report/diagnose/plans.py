@@ -1,0 +1,144 @@
+"""What `velap diagnose` measures of plans: trees from several starts, and how real their nodes are.
+
+B starts, N stacked frames, H x W pixels, D latent dimensions, M nodes of a tree, L waypoints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from velap.config import Config
+from velap.models.horizon import q_from_steps
+from velap.models.velap import LatentModel
+from velap.report.diagnose.model import Album
+from velap.search.est import plan
+from velap.search.types import Plan, SearchFns
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where plans begin."""
+
+    labels: tuple[str, ...]
+    """[B]."""
+    stacks: NDArray[np.uint8]
+    """[B, N, H, W, 3]."""
+
+
+@dataclass(frozen=True)
+class TreeNumbers:
+    """One plan in numbers."""
+
+    start: str
+    nodes: int
+    rejected: dict[str, int]
+    """Candidates by the reason, the names of `velap.search.types.Rejections`."""
+    start_value: float
+    """Q^g at the root [Q-value]."""
+    best_value: float
+    """Highest Q^g in the tree [Q-value]."""
+    reached_goal: bool
+    waypoints: int
+    """Of the chosen path, the root left out."""
+    cost: float
+    """[steps]"""
+    distance: float
+    """Mean distance of the nodes to the nearest state of the album [one-step lengths]."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A chain of latents as the real frames nearest to them."""
+
+    title: str
+    frames: NDArray[np.uint8]
+    """[L, H, W, 3]."""
+    captions: tuple[str, ...]
+    """[L]."""
+
+
+@dataclass(frozen=True)
+class Trees:
+    """Plans from all starts."""
+
+    numbers: tuple[TreeNumbers, ...]
+    held_out_distance: float
+    """Mean distance of held-out states to the album: what a real state has [one-step lengths]."""
+    scene_distance: float | None
+    """Mean distance of the first tree's nodes to real states of their own scene [one-step lengths]; None where these cannot
+    be had."""
+    scene_spacing: float | None
+    """Mean distance of those real states to the nearest other one [one-step lengths]."""
+    goal_value: float
+    """τ_goal [Q-value]."""
+    strip: Strip
+    """The plan from the first start."""
+
+
+def grow(model: LatentModel, config: Config, starts: Starts, seeds: Sequence[int]) -> tuple[Tensor, Plan]:
+    """Encode the starts and plan from them, each with the randomness of its seed: latents [B, D] and the plans."""
+    device = next(model.parameters()).device
+    with torch.inference_mode():
+        latents = model.encode(torch.from_numpy(starts.stacks).to(device)).float()
+    fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
+    return latents, plan(fns, latents, config.planner, [torch.Generator().manual_seed(seed) for seed in seeds])
+
+
+def tree_numbers(starts: Starts, result: Plan, album: Album, one_step: float) -> tuple[TreeNumbers, ...]:
+    """One entry a start."""
+    found = []
+    for row, label in enumerate(starts.labels):
+        size = int(result.tree.size[row])
+        values, latents = result.tree.goal_values[row, :size], result.tree.latents[row, :size]
+        rejected = {name: int(count[row]) for name, count in result.rejections._asdict().items()}
+        found.append(TreeNumbers(
+            label, size, rejected, float(values[0]), float(values.max()),
+            bool(result.reached_goal[row]), int(result.length[row]) - 1, float(result.cost[row]),
+            float(album.nearest(latents)[1].mean()) / one_step))
+    return tuple(found)
+
+
+def plan_strip(starts: Starts, result: Plan, album: Album, one_step: float, row: int = 0) -> Strip:
+    """The chosen path from one start: the start frame itself, then what lies nearest to each waypoint."""
+    length = int(result.length[row])
+    nodes = result.nodes[row, :length]
+    values = result.tree.goal_values[row, nodes].double().cpu().numpy()
+    frames, distances = album.nearest(result.waypoints[row, :length])
+    frames = frames.copy()
+    frames[0] = starts.stacks[row, -1]
+    captions = [f"start\n$Q^g$ {values[0]:.2g}"]
+    captions += [f"{number}: {distance / one_step:.1f} off\n$Q^g$ {value:.2g}"
+                 for number, (distance, value) in enumerate(zip(distances[1:], values[1:], strict=True), 1)]
+    return Strip(f"Plan from {starts.labels[row]}: nearest frames of {album.source} and how far off they are "
+                 "[one-step lengths]", frames, tuple(captions))
+
+
+def diagnose_trees(model: LatentModel, config: Config, starts: Starts, seeds: Sequence[int], album: Album,
+                   scenery: Album | None, held_out: Tensor, one_step: float) -> Trees:
+    """Plan from all starts and compare the nodes with real states.
+
+    Args:
+        model: what plans.
+        config: its planner.
+        starts: where from.
+        seeds: [B] randomness of each plan.
+        album: states of the dataset.
+        scenery: states of the first start's own scene, where they can be had; the film strip then shows these.
+        held_out: [R, D] states that were recorded and are not in the album.
+        one_step: mean distance of subsequent encodings [latent distance].
+    """
+    _, result = grow(model, config, starts, seeds)
+    scene_distance = spacing = None
+    if scenery is not None:
+        first = result.tree.latents[0, : int(result.tree.size[0])]
+        scene_distance, spacing = float(scenery.nearest(first)[1].mean()) / one_step, scenery.spacing() / one_step
+    return Trees(tree_numbers(starts, result, album, one_step), float(album.nearest(held_out)[1].mean()) / one_step,
+                 scene_distance, spacing,
+                 q_from_steps(config.planner.goal_exponent, model.discount),
+                 plan_strip(starts, result, scenery or album, one_step))

@@ -1,0 +1,231 @@
+"""The page of `velap diagnose`: every number with what it should be and what to try where it is not.
+
+The bounds are ours: they tell a model that works from one that does not, not a good one from a better one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from velap.models.horizon import steps_from_q
+from velap.report.diagnose.failures import CLASSES, REMEDIES, Failures
+from velap.report.diagnose.model import APART, LAST, LED, ActionValues, Pairs, RolloutError, ValueCurve
+from velap.report.diagnose.plans import TreeNumbers, Trees
+from velap.report.diagnose.world import NEAR, Scene
+from velap.search.types import Rejections
+
+if TYPE_CHECKING:
+    from velap.report.diagnose.command import Diagnosis
+
+ERROR_SHARE = 0.5
+"""A rollout errs by at most this share of the true displacement."""
+LOCAL_FACTOR = 2.0
+"""Q^l's steps within a trajectory are at most this factor off the steps taken, which are an upper bound themselves."""
+ALIASED = 0.05
+"""Share of states apart that Q^l may call the same."""
+RHO = 0.7
+"""Spearman's rho of learnt and true distances."""
+ACTION_RHO = 0.3
+"""Spearman's rho of what Q^g promises of an action and what comes of it; 0.4 to 0.75 where a task is solved."""
+GAIN = 10.0
+"""Steps by Q^g that a plan comes nearer to a goal that it does not find."""
+SUPPORT_FACTOR = 1.5
+"""Nodes of a tree are at most this factor farther from the data than held-out states are."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was measured."""
+
+    title: str
+    numbers: str
+    good: bool | None
+    """None where there is nothing to judge by."""
+    expected: str
+    advice: str
+
+    @property
+    def mark(self) -> str:
+        """One word."""
+        return {True: "ok", False: "LOOK", None: "info"}[self.good]
+
+
+def findings(diagnosis: Diagnosis) -> list[Finding]:
+    """Everything that was measured, in the order in which a fault spreads: model, distances, values, plans, episodes."""
+    limit = diagnosis.arrived_steps
+    found = [*_of_rollouts(diagnosis.rollout, diagnosis.simulated), *_of_pairs(diagnosis.pairs, limit)]
+    found += _of_scenes(diagnosis.scenes, limit) if diagnosis.scenes else []
+    found += [_of_curves(diagnosis.curves)] if diagnosis.curves else []
+    found.append(_of_actions(diagnosis.actions))
+    found += _of_trees(diagnosis.trees, diagnosis.discount)
+    return found + ([_of_failures(diagnosis.failures)] if diagnosis.failures is not None else [])
+
+
+def _of_rollouts(rollout: RolloutError, simulated: int) -> Iterator[Finding]:
+    """h and Q^l within trajectories."""
+    at = rollout.at(simulated)
+    error, moved, length = rollout.error[1, at], rollout.moved[1, at], rollout.lengths[at]
+    yield Finding(
+        "Dynamics h", f"after {length} steps a rollout is {error:.2f} one-step lengths off; the state has moved {moved:.2f}",
+        bool(error <= ERROR_SHARE * moved), f"an error of at most {ERROR_SHARE:.0%} of the displacement",
+        "train longer (train.joint_steps, train.latent_steps), simulate fewer steps a node (planner.n_sim), or check "
+        "whether model.frame_stack frames show the whole state")
+    steps = rollout.local_steps[1, at]
+    yield Finding(
+        "Q^l within a trajectory", f"states {length} steps apart are {steps:.1f} steps apart by Q^l (median)",
+        bool(length / LOCAL_FACTOR / LOCAL_FACTOR <= steps <= length * LOCAL_FACTOR),
+        f"at most about {length}, since a random walk takes detours, and not near 0",
+        "near 0: distances have collapsed, raise train.c1; far above: train longer")
+
+
+def _of_pairs(pairs: Sequence[Pairs], limit: float) -> Iterator[Finding]:
+    """Q^l between trajectories."""
+    for each in pairs:
+        aliased, share = each.aliased(limit), each.arrived(limit)
+        known = "" if aliased is None else (f", {aliased:.1%} of those whose agent is more than {APART * limit:.0f} steps "
+                                            "apart")
+        yield Finding(
+            f"Q^l, {each.name}", f"median {np.median(each.local_steps):.1f} steps; {share:.1%} of the pairs count as "
+            f"arrived (at most {limit:.0f} steps){known}", (share if aliased is None else aliased) <= ALIASED,
+            f"far more steps than within a trajectory, at most {ALIASED:.0%} that count as arrived",
+            "aliased states make short cuts through walls: draw windows together (train.group_windows), raise "
+            "model.frame_stack, or lower controller.waypoint_exponent")
+
+
+def _of_scenes(scenes: Sequence[Scene], limit: float) -> Iterator[Finding]:
+    """True distances in mazes."""
+    local, near, value = ([getattr(scene, name) for scene in scenes] for name in ("local_rho", "near_rho", "value_rho"))
+    aliased = max(scene.aliased(limit, APART * limit) or 0.0 for scene in scenes)
+    yield Finding(
+        "Q^l against shortest ways in test scenes", f"rho {_numbers(near)} up to {NEAR:.0f} steps, {_numbers(local)} in "
+        f"all; {aliased:.1%} of the pairs more than {APART * limit:.0f} steps apart count as arrived",
+        min(near) >= RHO and aliased <= ALIASED, f"rho of {RHO} and more up to {NEAR:.0f} steps, at most {ALIASED:.0%}; far "
+        "pairs are beyond what Q^l was taught",
+        "where recorded episodes above are fine and these are not, the encoder does not generalise to new scenes: more "
+        "contexts in the data, or train.group_windows")
+    yield Finding(
+        "Q^g against the shortest way to the goal", f"rho {_numbers(value)}", None,
+        f"high near the goal; {RHO} and more over a whole maze is a luxury, the tree does without", "see Q^g along episodes")
+
+
+def _of_curves(curves: Sequence[ValueCurve]) -> Finding:
+    """Q^g along rewarded episodes."""
+    rhos, errors = [curve.rho for curve in curves], [curve.steps_error for curve in curves]
+    ends = [float(curve.values[-2]) for curve in curves]
+    return Finding(
+        "Q^g before the reward", f"{_numbers(ends)} at the rewarded action, rho with time over the {LAST} steps before it "
+        f"{_numbers(rhos)}, {_numbers(errors, 0)} steps off (median over all) along {len(curves)} episodes",
+        min(ends) >= 0.5 and min(rhos) >= RHO,
+        f"near 1 at the rewarded action, rho of {RHO} and more; far from the goal Q^g may flatten, the tree searches there",
+        "low at the end: too few rewards seen, raise train.rewarded_share or add successes; flat: train longer")
+
+
+def _of_actions(actions: ActionValues) -> Finding:
+    """Q^g of actions against where they lead."""
+    rhos = [actions.rho(far) for far in (False, True)]
+    return Finding(
+        "Q^g of recorded actions against what comes of them", f"rho {_numbers(rhos)} in the nearer and the farther half of "
+        f"{len(actions.away)} transitions (Q^g {LED} steps later)",
+        None if any(math.isnan(rho) for rho in rhos) else min(rhos) >= ACTION_RHO,
+        f"{ACTION_RHO} and more in both, 0.4 to 0.75 on our own tasks; π^g climbs Q^g over actions, so of two models the "
+        "one with the lower rho knows less where to go, however right its values along episodes are",
+        "low in the farther half: the critics see steps near the goal alone, train.critic_floor; low in the nearer half: "
+        "more rewarded data, or train.c3 for more imitation")
+
+
+def _of_trees(trees: Trees, discount: float) -> Iterator[Finding]:
+    """Plans."""
+    numbers = trees.numbers
+    reached = sum(each.reached_goal for each in numbers)
+    nodes = [each.nodes for each in numbers]
+    best = [each.best_value for each in numbers]
+    gains = [steps_from_q(each.start_value, discount) - steps_from_q(each.best_value, discount) for each in numbers]
+    yield Finding(
+        "Trees", f"{reached} of {len(numbers)} plans find the goal (Q^g above {trees.goal_value:.2f}); best Q^g "
+        f"{_numbers(best)}, {_numbers(gains, 0)} steps nearer than the start; {min(nodes)} to {max(nodes)} nodes",
+        all(each.reached_goal or gain >= GAIN for each, gain in zip(numbers, gains, strict=True)),
+        f"the goal, or where it is far a place at least {GAIN:.0f} steps nearer by Q^g",
+        _tree_advice(numbers))
+    distances = [each.distance for each in numbers]
+    typical = float(np.median(distances))
+    yield Finding(
+        "Tree nodes against real states", f"nodes are {_numbers(distances)} one-step lengths from the nearest frame of "
+        f"the data (means), recorded states that were kept apart {trees.held_out_distance:.2f}",
+        typical <= max(SUPPORT_FACTOR * trees.held_out_distance, 1.0),
+        f"at most a step, or {SUPPORT_FACTOR} times as far as recorded states", "the tree leaves the data: planner.anchor="
+        "reject, fewer planner.n_sim, or better dynamics; from new scenes some excess is normal")
+    if trees.scene_distance is not None and trees.scene_spacing is not None:
+        yield Finding(
+            "Tree nodes against their own scene", f"nodes from {numbers[0].start} are {trees.scene_distance:.2f} one-step "
+            f"lengths from the nearest real state of that scene, its real states {trees.scene_spacing:.2f} from each other",
+            trees.scene_distance <= max(SUPPORT_FACTOR * trees.scene_spacing, 1.0),
+            f"at most a step, or {SUPPORT_FACTOR} times as far as real states", "the tree drifts into other scenes or out "
+            "of all: more contexts in the data, fewer planner.n_sim, shorter edges (planner.discard_low_exponent)")
+
+
+def _tree_advice(numbers: Sequence[TreeNumbers]) -> str:
+    """By the commonest reason of rejection."""
+    totals = {name: sum(each.rejected[name] for each in numbers) for name in Rejections._fields}
+    commonest = max(totals, key=lambda name: totals[name])
+    advice = {
+        "unsupported": "most candidates leave the data: raise planner.anchor_factor or improve the dynamics",
+        "low": "most candidates are called too far from their parent: raise planner.discard_low_exponent, or check Q^l",
+        "std": "the ensemble disagrees on most candidates: raise planner.discard_std, or train longer",
+        "high": "most candidates are near a node already: the reachable space is full, or Q^l takes different states for "
+                "one; see the share that counts as arrived",
+    }[commonest]
+    return f"{advice}; or raise planner.n_iter"
+
+
+def _of_failures(failures: Failures) -> Finding:
+    """Episodes."""
+    counts = {kind: count for kind, count in failures.counts.items() if count}
+    failed = {kind: count for kind, count in counts.items() if kind != "solved"}
+    advice = REMEDIES[max(failed, key=lambda kind: failed[kind])] if failed else "nothing failed"
+    text = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    return Finding("Episodes", text, 2 * failures.counts["solved"] >= len(failures.outcomes), "solved ones", advice)
+
+
+def _numbers(values: Sequence[float], digits: int = 2) -> str:
+    return " / ".join("-" if math.isnan(value) else f"{value:.{digits}f}" for value in values)
+
+
+def page(diagnosis: Diagnosis) -> str:
+    """The report, in Markdown."""
+    lines = [f"# Diagnosis of {diagnosis.subject}", "", f"Written by `{diagnosis.command}`. {diagnosis.origin}", ""]
+    lines += [f"Left out: {text}\n" for text in diagnosis.left_out]
+    lines += [f"- {each.mark} **{each.title}**: {each.numbers}. *Expected*: {each.expected}. *Otherwise*: {each.advice}."
+              for each in findings(diagnosis)]
+    lines += ["", "Faults spread downwards: mend the first `LOOK` first. One-step length: mean distance of subsequent "
+              f"encodings, {diagnosis.rollout.one_step:.3g}. Q-values are read as steps by log_γ; the bounds are rules of "
+              "thumb.", ""]
+    lines += [f"![{name}]({name})" for name in diagnosis.pictures[:-1]] + ["", *_tree_table(diagnosis.trees)]
+    if diagnosis.failures is not None:
+        lines += ["", *_failure_table(diagnosis.failures)]
+    return "\n".join([*lines, "", f"![{diagnosis.pictures[-1]}]({diagnosis.pictures[-1]})", ""])
+
+
+def _tree_table(trees: Trees) -> list[str]:
+    """Every plan on a line."""
+    return ["## Trees", "", "Rejected candidates by the first reason that held: beyond the data, too far from the parent "
+            "(low), ensemble disagrees (std), too near another node (high).", "",
+            "| from | nodes | beyond | low | std | high | Q^g at the root | best Q^g | goal found | waypoints | steps |",
+            "| --- " * 11 + "|",
+            *(f"| {each.start} | {each.nodes} | {' | '.join(str(count) for count in each.rejected.values())} | "
+              f"{each.start_value:.4f} | {each.best_value:.4f} | {'yes' if each.reached_goal else 'no'} | "
+              f"{each.waypoints} | {each.cost:.0f} |" for each in trees.numbers)]
+
+
+def _failure_table(failures: Failures) -> list[str]:
+    """Every episode on a line, and what the classes mean."""
+    rows = [f"| {each.seed} | {each.kind} | {each.steps} | {'-' if each.farthest is None else f'{each.farthest:.2f}'} | "
+            f"{each.best_value:.3f} | {each.by_global:.0%} | "
+            f"{'-' if each.goal_steps is None else f'{each.goal_steps:.0f}'} |" for each in failures.outcomes]
+    return ["## Episodes", "", "| seed | class | steps | farthest from start [m] | best Q^g | led by π^g near the goal | "
+            "nearest to goal [steps] |", "| --- " * 7 + "|", *rows, "", "The first class that holds:", "",
+            *(f"- **{kind}**: {meaning}." for kind, meaning in CLASSES.items())]

@@ -1,0 +1,164 @@
+"""The picture of Fig. 3: planned waypoints in the frame, latents and tree in a 2-D Isomap, Q^g over the robot's position.
+
+P probed states, D latent dimensions, L waypoints, M nodes of a tree, S frame size [px].
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.manifold import Isomap
+
+from velap.data.frames import stack_indices
+from velap.evaluation.rollout import FrameReader
+from velap.models.velap import LatentModel
+from velap.runs import write_atomic
+from velap.search.types import Plan
+
+PROBES = 1200
+"""States a latent map is made of. ours: about one per hundredth of SpiralMaze's corridor."""
+NEIGHBOURS = 10
+"""Neighbours of the Isomap graph. ours."""
+SMALLEST_SHOWN = 1e-3
+"""Lower end of the logarithmic colours [Q-value]. ours: γ^169."""
+
+
+@dataclass(frozen=True)
+class LatentMap:
+    """Latents whose robot positions are known: what a latent that a planner dreamt up would look like in the world."""
+
+    latents: NDArray[np.float32]
+    """[P, D]."""
+    positions: NDArray[np.float64]
+    """[P, 2] [m]."""
+    values: NDArray[np.float32]
+    """[P] Q^g [Q-value]."""
+    extent: tuple[float, float, float, float]
+    """Left, right, bottom, top of the frame [m]."""
+    frames: NDArray[np.uint8]
+    """[P, S, S, 3] what the agent sees there."""
+
+    def locate(self, latents: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Positions [*, 2] of the probed states nearest to latents [*, D] [m]."""
+        squares = (self.latents**2).sum(-1) - 2 * latents @ self.latents.T
+        return self.positions[squares.argmin(-1)]
+
+
+def can_probe(env: gym.Env[Any, Any]) -> bool:
+    """Whether the environment can put its robot where it is told and says what its camera sees."""
+    return all(hasattr(env.unwrapped, name) for name in ("set_agent_position", "free_positions", "extent"))
+
+
+@torch.inference_mode()
+def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_stack: int, rng: np.random.Generator,
+          count: int = PROBES, seed: int = 0) -> LatentMap:
+    """Encode `count` states at uniform free positions, each after a few steps of one random action, as in the data.
+
+    `seed` is the environment's: it chooses the scene.
+    """
+    world: Any = env.unwrapped
+    space = env.action_space
+    assert isinstance(space, gym.spaces.Box)
+    stacks, positions, actions = [], [], []
+    env.reset(seed=seed)
+    for start in world.free_positions(rng, count):
+        world.set_agent_position(start)
+        action = rng.uniform(space.low, space.high).astype(space.dtype)
+        frames = [read(world.step(action)[0]) for _ in range(frame_stack)]
+        stacks.append(np.stack([frames[row] for row in stack_indices(np.array(frame_stack - 1), np.array(0), frame_stack)]))
+        positions.append(world.agent_position()[:2])
+        actions.append(action)
+    device = next(model.parameters()).device
+    everything = np.stack(stacks)
+    share = 1 - model.config.command_memory**frame_stack  # of the one action in the leaky mean
+    commands = share * model.to_unit(torch.from_numpy(np.stack(actions).astype(np.float32)).to(device))
+    batches = zip(torch.from_numpy(everything).split(256), commands.split(256), strict=True)
+    latents = torch.cat([model.encode(batch.to(device), before) for batch, before in batches])
+    values = model.value(latents).float().cpu().numpy()
+    return LatentMap(latents.float().cpu().numpy(), np.stack(positions), values, world.extent,
+                     everything[:, -1])
+
+
+def to_pixels(positions: NDArray[np.float64], extent: tuple[float, float, float, float], size: int) -> NDArray[np.float64]:
+    """Positions [*, 2] [m] -> column and row [*, 2] [px] in a frame of `size` [px]."""
+    left, right, bottom, top = extent
+    x, y = positions[..., 0], positions[..., 1]
+    return np.stack([(x - left) / (right - left) * size, (top - y) / (top - bottom) * size], -1)
+
+
+def plan_figure(path: Path, frame: NDArray[np.uint8], plan: Plan, row: int, latent_map: LatentMap, title: str) -> None:
+    """Draw the plan of one row into a PNG.
+
+    Args:
+        path: where to.
+        frame: uint8 [S, S, 3] the state that was planned from.
+        plan: plans of a batch.
+        row: which of them.
+        latent_map: where latents are in the world.
+        title: above the picture.
+    """
+    from matplotlib.colors import LogNorm
+
+    waypoints = plan.waypoints[row, : plan.length[row]].float().cpu().numpy()
+    size = int(plan.tree.size[row])
+    nodes = plan.tree.latents[row, :size].float().cpu().numpy()
+    parents = plan.tree.parents[row, :size].cpu().numpy()
+    shown = np.clip(latent_map.values, SMALLEST_SHOWN, 1)
+    colours = {"c": shown, "norm": LogNorm(SMALLEST_SHOWN, 1), "cmap": "viridis", "s": 14}
+
+    figure = new_figure(15, 5, title)
+    in_frame, in_latents, in_world = figure.subplots(1, 3)
+    _draw_frame(in_frame, frame, latent_map, waypoints)
+    _draw_isomap(in_latents, latent_map, nodes, parents, waypoints, colours)
+    points = in_world.scatter(*latent_map.positions.T, **colours)
+    in_world.set(title="$Q^g$ over the robot's position", xlabel="x [m]", ylabel="y [m]", aspect="equal",
+                 xlim=latent_map.extent[:2], ylim=latent_map.extent[2:])
+    figure.colorbar(points, ax=(in_latents, in_world), label="$Q^g$", shrink=0.9)
+    save_figure(figure, path)
+
+
+def new_figure(width: float, height: float, title: str) -> Any:
+    """An empty figure of that size [inches] that needs no screen."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    return figure
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """A whole PNG or none; raises StorageError."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=110, format="png")
+    write_atomic(path, content.getvalue())
+
+
+def _draw_frame(axes: Any, frame: NDArray[np.uint8], latent_map: LatentMap, waypoints: NDArray[np.float32]) -> None:
+    """The frame with the waypoints at their positions."""
+    axes.imshow(frame, extent=latent_map.extent, interpolation="nearest")
+    axes.plot(*latent_map.locate(waypoints).T, "o-", color="tab:orange", markersize=5, linewidth=1.5)
+    axes.set(title=f"frame and {len(waypoints) - 1} planned waypoints", xlabel="x [m]", ylabel="y [m]")
+
+
+def _draw_isomap(axes: Any, latent_map: LatentMap, nodes: NDArray[np.float32], parents: NDArray[np.int64],
+                 waypoints: NDArray[np.float32], colours: dict[str, Any]) -> None:
+    """Probed latents in the plane that keeps their distances along the manifold best, with the tree and the chosen path."""
+    isomap = Isomap(n_neighbors=NEIGHBOURS, n_components=2)
+    embedded = isomap.fit_transform(latent_map.latents)
+    tree, path = isomap.transform(nodes), isomap.transform(waypoints)
+    axes.scatter(*embedded.T, **colours)
+    edges = np.stack([tree[1:], tree[parents[1:]], np.full_like(tree[1:], np.nan)], 1).reshape(-1, 2)
+    axes.plot(*edges.T, color="0.25", linewidth=0.6, alpha=0.7, label=f"tree, {len(nodes)} nodes")
+    axes.plot(*path.T, "o-", color="tab:red", markersize=4, linewidth=2, label="chosen path")
+    axes.plot(*path[0], "*", color="black", markersize=13, label="now")
+    axes.set(title="2-D Isomap of latents", xticks=[], yticks=[])
+    axes.legend(loc="best", fontsize=8)

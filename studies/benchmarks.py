@@ -1,0 +1,392 @@
+"""The benchmarks of `velap bench`, one function each: both sides measured in one run, in turns, so that a slow moment of the
+machine hits both.
+
+Letters: B environments, D latent.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from velap.config import ModelConfig, override
+from velap.config.planning import PlannerConfig
+from velap.data.frames import FrameStore, load_store, make_store, write_dataset
+from velap.errors import CheckpointError, VelapError
+from velap.models.velap import LatentModel, Spaces, load_checkpoint
+from velap.report.demo import released_checkpoint
+from velap.runs import make_generator
+from velap.search.est import plan
+from velap.search.shooting import MPPIConfig, shoot
+from velap.search.types import SearchFns
+from velap.tasks import get_task, make_config
+from velap.training.loop import Trainer, keep_freed_memory, train
+
+TASK = "SpiralMaze"
+DATASET = "bench/synthetic-v0"
+GIB = 2**30
+PLANS_A_TURN = 8
+"""Plans for one environment between two of MPPI, whose threads go on spinning for some milliseconds after it."""
+MPPI_BATCH = 8
+"""Environments that MPPI plans for at once; its 1000 samples a row make larger batches no faster a row."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One side by side comparison."""
+
+    value: float
+    unit: str
+    reference_name: str
+    reference_value: float | None
+    """In the same unit; None where the reference cannot run here."""
+
+    @property
+    def ratio(self) -> float | None:
+        """Value over reference."""
+        return self.value / self.reference_value if self.reference_value else None
+
+
+def in_turns(sides: Sequence[Callable[[], object]], repeats: int, device: torch.device) -> list[float]:
+    """Median time of each side [s], after one round to warm up; the sides take turns."""
+    times: list[list[float]] = [[] for _ in sides]
+    for round_ in range(repeats + 1):
+        for side, kept in zip(sides, times, strict=True):
+            began = time.perf_counter()
+            side()
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
+            if round_:
+                kept.append(time.perf_counter() - began)
+    return [statistics.median(kept) for kept in times]
+
+
+def synthetic_store(trajectories: int | None = None) -> FrameStore:
+    """A dataset in the shape of the task's recipe: full-length trajectories, every fortieth rewarded at its end."""
+    recipe = get_task(TASK).recipe
+    episodes, steps = trajectories or recipe.trajectories, recipe.max_steps
+    rng = np.random.default_rng(0)
+    frames = np.zeros((episodes * (steps + 1), 64, 64, 3), np.uint8)
+    frames[:, 16:48, 16:48] = rng.integers(0, 256, (len(frames), 32, 32, 3), np.uint8)
+    last = np.arange(len(frames)) % (steps + 1) == steps
+    end = np.roll(last, -1)
+    rewarded = end & (np.arange(len(frames)) // (steps + 1) % 40 == 0)
+    actions = rng.uniform(-1, 1, (len(frames), 2)).astype(np.float32)
+    actions[last] = 0
+    return make_store(frames, actions, rewarded.astype(np.float32), rewarded, end & ~rewarded, np.full(episodes, steps),
+                      np.full(2, -1.0), np.full(2, 1.0), DATASET)
+
+
+def train_frames_per_s(device: torch.device) -> Measurement:
+    """Joint updates as SpiralMaze trains, one frame a state."""
+    return _train_frames_per_s(device, make_config(TASK).model.frame_stack)
+
+
+def train_frames_per_s_stack3(device: torch.device) -> Measurement:
+    """Joint updates with the default of three frames a state, nine channels."""
+    return _train_frames_per_s(device, ModelConfig().frame_stack)
+
+
+def train_minutes(device: torch.device) -> Measurement:
+    """A whole training of WindowClose, the sum over its phases of updates over measured rate; on CUDA against the same
+    updates without graphs, on a CPU against nothing."""
+    keep_freed_memory()
+    settings, minutes = make_config("WindowClose"), list[float]()
+    sides = (True, False) if device.type == "cuda" else (False,)
+    for graphs in sides:
+        with TemporaryDirectory() as folder:
+            trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
+            trainer.learner.graphs = graphs
+            minutes.append(training_minutes(trainer))
+    updates = ", ".join(f"{steps} {name}" for name, steps in settings.train.phases if steps)
+    name = "without CUDA graphs" if len(sides) > 1 else "none"
+    return Measurement(minutes[0], "min", f"{name}; updates: {updates}", minutes[1] if len(sides) > 1 else None)
+
+
+def training_minutes(trainer: Trainer, warm: int = 16, count: int = 200, most: float = 6.0) -> float:
+    """Minutes of all updates of a run, by each phase's rate: that of `count` updates after `warm` ones, or of as many as
+    `most` [s] are enough for."""
+    minutes, begins = 0.0, 0
+    for _, steps in trainer.config.train.phases:
+        if steps == 0:
+            continue
+        trainer.step = begins
+        for _ in range(min(warm, steps)):
+            trainer.update()
+        began, done = _now(trainer.device), 0
+        while done < count and (done == 0 or time.perf_counter() - began < most):
+            trainer.step = begins + min(warm, steps - 1)
+            trainer.update()
+            done += 1
+        minutes += steps * (_now(trainer.device) - began) / done / 60
+        begins += steps
+    return minutes
+
+
+def _now(device: torch.device) -> float:
+    """Seconds of a clock, once the device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
+    """Joint updates against the forward and backward pass of the encoder alone on frames that lie ready."""
+    keep_freed_memory()
+    with TemporaryDirectory() as folder:
+        settings = override(make_config(TASK), model={"frame_stack": frame_stack})
+        trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
+        config, encoder = trainer.config.train, trainer.model.encoder
+        batch = trainer.sampler.sample(config.batch_windows, config.window, config.whole_windows, trainer.generator)
+        stacks = trainer.sampler.stacks(batch.rows)
+        updates = 4 * config.policy_every
+
+        def update() -> None:
+            for _ in range(updates):
+                trainer.update()
+
+        def encode() -> None:
+            for _ in range(updates):
+                encoder.zero_grad(set_to_none=True)
+                latents = encoder(stacks)
+                latents.backward(torch.ones_like(latents))
+
+        trained, encoded = in_turns([update, encode], 12, device)
+    frames = updates * len(stacks)
+    return Measurement(frames / trained, "frames/s", f"encoder alone, forward and backward, batch of {len(stacks)} frames, "
+                       f"stacks of {frame_stack}, {config.precision}", frames / encoded)
+
+
+def _planning_model(device: torch.device) -> tuple[LatentModel, PlannerConfig, str]:
+    """The released checkpoint, or random weights with thresholds that let every tree fill; and which it is."""
+    planner = make_config(TASK, "paper").planner
+    try:
+        model, _, _ = load_checkpoint(released_checkpoint(TASK), device)
+        return model, planner, "released checkpoint"
+    except CheckpointError:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            model = LatentModel(make_config(TASK).model, Spaces(64, 64, (-1.0, -1.0), (1.0, 1.0)), 0.96).eval()
+    model.to(device).requires_grad_(False)
+    latents = _roots(model, 256)
+    actions = torch.rand(256, 2, generator=make_generator(1)).to(device) * 2 - 1
+    model.step_distance.copy_((model.step(latents, actions) - latents).norm(dim=-1).quantile(0.95))
+    changes = {"discard_low_exponent": 1e4, "discard_std": 2.0, "discard_high_exponent": 1e-6}
+    return model, override(make_config(TASK, "paper"), planner=changes).planner, "random weights, full trees"
+
+
+@torch.inference_mode()
+def _roots(model: LatentModel, batch: int) -> Tensor:
+    """[B, D] latents to plan from: of the dataset where the model keeps some, else of frames of noise."""
+    generator = make_generator(0)
+    if model.bank_latents.any():
+        return model.bank_latents[torch.randint(len(model.bank_latents), (batch,), generator=generator)].float()
+    frames = torch.randint(256, (batch, model.config.frame_stack, 64, 64, 3), generator=generator, dtype=torch.uint8)
+    return model.encode(frames.to(model.bank_latents.device))
+
+
+def _plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int = PlannerConfig().n_sim) -> Measurement:
+    """Latency per environment of a VELAP plan for `batch` environments at once against MPPI with the same model."""
+    model, planner, kind = _planning_model(device)
+    planner = replace(planner, n_sim=n_sim)
+    fns = SearchFns(**model.search_fns(planner.neighbour_distance_factor))
+    shots, together, seeds = MPPIConfig(), min(batch, MPPI_BATCH), count()
+    roots, plans = _roots(model, batch), PLANS_A_TURN if batch == 1 else 1
+
+    def velap_plans() -> None:
+        for _ in range(plans):
+            plan(fns, roots, planner, make_generator(next(seeds), device=device))
+
+    def mppi_plans() -> None:
+        shoot(fns, roots[:together], shots, make_generator(next(seeds), device=device))
+
+    velap_s, mppi_s = in_turns([velap_plans, mppi_plans], repeats, device)
+    chunk = f", {together} of the {batch} environments at once" if together < batch else ""
+    name = (f"MPPI {shots.samples} × {shots.horizon} × {shots.iterations}{chunk}; VELAP {planner.n_iter} expansions of "
+            f"{planner.n_sim} steps; {kind}")
+    return Measurement(1e3 * velap_s / (plans * batch), "ms/environment", name, 1e3 * mppi_s / together)
+
+
+def plan_latency_1(device: torch.device) -> Measurement:
+    """One environment, Table 8's setting for most tasks."""
+    return _plan_latency(device, 1, 9)
+
+
+def plan_latency_1_sim10(device: torch.device) -> Measurement:
+    """One environment, expansions of 10 steps, Table 8's setting for SpiralMaze, ButtonWall and DrawerButton."""
+    return _plan_latency(device, 1, 9, n_sim=10)
+
+
+def plan_latency_64(device: torch.device) -> Measurement:
+    """64 environments at once."""
+    return _plan_latency(device, 64, 3)
+
+
+META_WORLD = """
+import sys, time, gymnasium
+env = gymnasium.make("metaworld:Meta-World/MT1", env_name="window-close-v3", render_mode="rgb_array", width=64, height=64,
+                     camera_name="corner", disable_env_checker=True)
+env.reset(seed=0)
+env.action_space.seed(0)
+print(env.render().std(), flush=True)
+for line in sys.stdin:
+    began = time.perf_counter()
+    for _ in range(int(line)):
+        env.step(env.action_space.sample())
+        env.render()
+    print(time.perf_counter() - began, flush=True)
+"""
+"""Meta-World as delivered, in a process of its own: two OpenGL contexts in one process disturb each other."""
+
+
+@contextmanager
+def meta_world(backend: str) -> Iterator[Callable[[int], float] | None]:
+    """A function that runs so many steps of WindowClose with 64 × 64 pixels and returns their time [s]; None without
+    Meta-World."""
+    environment = {key: value for key, value in os.environ.items() if key != "LP_NUM_THREADS"}
+    with subprocess.Popen([sys.executable, "-c", META_WORLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                          stderr=subprocess.DEVNULL, text=True, env={**environment, "MUJOCO_GL": backend}) as child:
+        assert child.stdin is not None
+        assert child.stdout is not None
+        pipes = child.stdin, child.stdout
+
+        def run(steps: int) -> float:
+            print(steps, file=pipes[0], flush=True)
+            return float(pipes[1].readline())
+
+        try:
+            draws = float(child.stdout.readline() or 0) > 0
+            yield run if draws else None
+        finally:
+            child.kill()
+
+
+def env_steps_per_s(device: torch.device) -> Measurement:
+    """Steps of SpiralMaze with their 64 × 64 frame; Meta-World's are another task, a manipulator of meshes."""
+    return _env_steps_per_s(TASK, "another task: ")
+
+
+def sawyer_env_steps_per_s(device: torch.device) -> Measurement:
+    """Steps of WindowClose with their 64 × 64 frame; Meta-World's are the same physics drawn by its own `render()`."""
+    return _env_steps_per_s("WindowClose", "")
+
+
+def _env_steps_per_s(name: str, note: str) -> Measurement:
+    """Environment steps of a task with their frame, random actions, against Meta-World's step and render in turns."""
+    from velap.envs.gl import working_backend
+
+    env: gym.Env[Any, Any] = gym.make(f"velap.envs:{get_task(name).env_id}")
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    steps, reference_steps, repeats = min(300, get_task(name).max_steps), 12, 5
+    times: list[float] = []
+    reference_times: list[float] = []
+    with meta_world(working_backend()) as reference:
+        for _ in range(repeats + 1):
+            env.reset()
+            began = time.perf_counter()
+            for _ in range(steps):
+                env.step(env.action_space.sample())
+            times.append((time.perf_counter() - began) / steps)
+            if reference is not None:
+                reference_times.append(reference(reference_steps) / reference_steps)
+    env.close()
+    described = f"{note}Meta-World's window-close-v3, step + render(64 × 64), {working_backend()}"
+    if reference is None:
+        return Measurement(1 / statistics.median(times[1:]), "steps/s", f"{described}; it does not run here", None)
+    return Measurement(1 / statistics.median(times[1:]), "steps/s", described, 1 / statistics.median(reference_times[1:]))
+
+
+COLLECTED_CONTEXTS = 20
+"""Contexts of WindowClose that `collect_frames_per_s` collects, of 200."""
+
+
+def collect_frames_per_s(device: torch.device) -> Measurement:
+    """`velap collect WindowClose` on all cores, from the start of its processes to the written dataset with its card.
+
+    The bound: 100,000 frames in 10 minutes on 2 cores.
+    """
+    from velap.data.collection import collect
+
+    task = get_task("WindowClose")
+    short = replace(task, recipe=replace(task.recipe, contexts=COLLECTED_CONTEXTS))
+    with TemporaryDirectory() as folder, _datasets_in(folder):
+        result = collect(short, dataset_id="bench/collected-v0")
+    cores = len(os.sched_getaffinity(0))
+    return Measurement((result.transitions + result.episodes) / result.seconds, "frames/s",
+                       f"the bound: 100,000 frames in 10 minutes; {COLLECTED_CONTEXTS} contexts of WindowClose, "
+                       f"{cores} cores",
+                       100_000 / 600)
+
+
+@contextmanager
+def _datasets_in(folder: str) -> Iterator[None]:
+    """Minari's datasets lie in `folder` for a while."""
+    key = "MINARI_DATASETS_PATH"
+    before = os.environ.get(key)
+    os.environ[key] = folder
+    try:
+        yield
+    finally:
+        os.environ.pop(key)
+        if before is not None:
+            os.environ[key] = before
+
+
+def train_rss(device: torch.device) -> Measurement:
+    """Peak memory of a training process (dataset read, both phases, checkpoints) beyond the bytes of its dataset."""
+    with TemporaryDirectory() as folder:
+        _child("write_synthetic()", folder)
+        run_dir = str(Path(folder) / "run")
+        peak, dataset = (int(number) for number in _child(f"print_peak({run_dir!r}, {device.type!r})", folder).split())
+    return Measurement((peak - dataset) / GIB, "GiB", f"the bound: 2 GiB beyond the dataset's {dataset / GIB:.2f}", 2.0)
+
+
+def _child(call: str, datasets: str) -> str:
+    """The last line that a function of this module prints in a process of its own."""
+    code = f"from studies.benchmarks import *; {call}"
+    done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "MINARI_DATASETS_PATH": datasets},
+                          capture_output=True, text=True)
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or ["it left no message"])[-1]
+        raise VelapError(f"`{call}` ended with code {done.returncode} in a process of its own: {reason}. Expected it to "
+                         "finish; measure the other benchmarks with --only, or report it.")
+    return (done.stdout.splitlines() or [""])[-1]
+
+
+def write_synthetic() -> None:
+    """Body of the process that writes the dataset of `train_rss`."""
+    write_dataset(synthetic_store())
+
+
+def print_peak(run_dir: str, device: str) -> None:
+    """Body of the process that `train_rss` measures: trains and prints its peak and the dataset's size [bytes]."""
+    short = {"joint_steps": 30, "latent_steps": 30, "checkpoint_every": 20, "diagnose_every": 20, "log_every": 10}
+    store = load_store(DATASET)
+    train(override(make_config(TASK), train=short), store, Path(run_dir), device=device)
+    print(peak_memory(), store.nbytes)
+
+
+def peak_memory() -> int:
+    """Largest resident memory of this process so far [bytes]. Its program alone: getrusage counts what forked it as well."""
+    import resource
+
+    status = Path("/proc/self/status")
+    if status.exists():
+        return next(1024 * int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

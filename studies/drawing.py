@@ -1,0 +1,113 @@
+"""`velap figure sawyer-drawing`: the simplified drawing of the manipulation tasks beside Meta-World's own geometry.
+
+Letters: N states, H×W frame [px].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from velap.runs import storage_errors
+from velap.tasks import get_task
+
+TASKS = ("WindowClose", "FaucetClose", "ButtonWall", "DrawerButton")
+SEEDS = range(4)
+"""Test episodes of the expert that a comparison walks through."""
+EVERY = 10
+"""Steps between two compared states [steps]."""
+GAIN = 4
+"""How much brighter the picture shows a difference."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Both drawings of some states of a task."""
+
+    task: str
+    originals: NDArray[np.uint8]
+    """[N, H, W, 3] Meta-World's own geometry: same camera, same lights, no shadows."""
+    ours: NDArray[np.uint8]
+    """[N, H, W, 3] as the task draws."""
+
+    @property
+    def differences(self) -> NDArray[np.int64]:
+        """[N, H, W, 3] absolute differences, of 255."""
+        return np.abs(self.originals.astype(np.int64) - self.ours)
+
+    @property
+    def mean(self) -> float:
+        """Mean difference, of 255."""
+        return float(self.differences.mean())
+
+    @property
+    def percentile99(self) -> float:
+        """99th percentile over pixels of the largest difference of their channels, of 255."""
+        return float(np.percentile(self.differences.max(-1), 99))
+
+
+def compare(task: str, seeds: Sequence[int] = SEEDS, every: int = EVERY) -> Comparison:
+    """Draw test episodes of the expert both ways, every so many steps, start and success included."""
+    from velap.envs.sawyer.scene import OriginalScene
+
+    env: Any = gym.make(f"velap.envs:{get_task(task).env_id}").unwrapped
+    original = OriginalScene(env.model)
+    pairs = [(original.draw(env.model, env.data), env.render()) for seed in seeds for _ in _states(env, seed, every)]
+    originals, ours = (np.stack(frames) for frames in zip(*pairs, strict=True))
+    return Comparison(task, originals, ours)
+
+
+def _states(env: Any, seed: int, every: int) -> Iterator[int]:
+    """Walk the environment through an episode of its expert; stops at every so many steps and at its end."""
+    env.reset(seed=seed)
+    yield 0
+    for step in range(1, 300):
+        done = env.advance(env.expert_action())
+        if done or step % every == 0:
+            yield step
+        if done:
+            return
+
+
+def drawing_figure(path: Path, comparisons: Sequence[Comparison]) -> None:
+    """First and last state of each task: Meta-World's geometry, ours, and the difference."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 2.25 * len(comparisons)), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(comparisons), 6, squeeze=False)
+    for row, found in zip(grid, comparisons, strict=True):
+        row[0].set_ylabel(f"{found.task}\nmean {found.mean:.1f}, p99 {found.percentile99:.0f}")
+        for first, state in ((0, 0), (3, len(found.ours) - 1)):
+            shown = np.minimum(255, GAIN * found.differences[state]).astype(np.uint8)
+            for axes, frame in zip(row[first : first + 3], (found.originals[state], found.ours[state], shown), strict=True):
+                axes.imshow(frame, interpolation="nearest")
+                axes.set(xticks=[], yticks=[])
+    for axes, title in zip(grid[0], ("Meta-World", "velap", f"difference × {GAIN}") * 2, strict=True):
+        axes.set_title(title)
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=100)
+
+
+def show_drawing(console: Console, path: Path) -> None:
+    """Compare all tasks, print the differences and write the picture."""
+    comparisons = []
+    for task in TASKS:
+        with console.status(f"drawing {task}"):
+            comparisons.append(compare(task))
+    table = Table("task", "frames", "mean difference", "99th percentile", caption="of 255, 64 × 64 px, shadows off")
+    for found in comparisons:
+        table.add_row(found.task, str(len(found.ours)), f"{found.mean:.2f}", f"{found.percentile99:.0f}")
+    drawing_figure(path, comparisons)
+    console.print(table)
+    console.print(f"picture {path}", markup=False)

@@ -1,0 +1,232 @@
+"""`kill -9` at random moments of training and collecting, then resuming: all files readable, the same final bits.
+
+Runs are `velap` commands in processes of their own, on a SpiralMaze shrunk to seconds (`shrink`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from velap.errors import VelapError
+from velap.tasks import TASKS
+
+TASK = "SpiralMaze"
+SMALL = {
+    "train": {"joint_steps": 12, "latent_steps": 12, "batch_windows": 4, "latent_batch": 8, "log_every": 2,
+              "diagnose_every": 6, "checkpoint_every": 2, "holdout_episodes": 2},
+    "planner": {"n_iter": 10, "candidates": 5}, "model": {"bank_size": 32},
+}
+"""Config fields of the shrunk task. ours: a run of seconds that checkpoints every other step, in both phases."""
+TRAJECTORIES = 120
+"""Trajectories of the shrunk recipe: some reach the goal."""
+FILE_LIMIT, KILL_AT = "VELAP_FILE_LIMIT", "VELAP_KILL_AT_FSYNC"
+"""Environment variables of `shrunk_main`: largest file [bytes], number of the fsync to die at."""
+CODE = "import sys; from studies.kills import shrunk_main; from velap.cli import main; sys.exit(shrunk_main(main))"
+
+
+def shrink() -> None:
+    """Replace SpiralMaze in this process by a version with little data and little training."""
+    task = TASKS[TASK]
+    recipe = dataclasses.replace(task.recipe, trajectories=TRAJECTORIES)
+    TASKS[TASK] = dataclasses.replace(task, recipe=recipe, overrides={}, default_overrides=SMALL)
+
+
+def shrunk_main(main: Callable[[], int]) -> int:
+    """`main`, the command line, with the shrunk task and with faults that the environment asks for."""
+    if FILE_LIMIT in os.environ:
+        import resource
+
+        limit = int(os.environ[FILE_LIMIT])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    if KILL_AT in os.environ:
+        _kill_at_fsync(int(os.environ[KILL_AT]))
+    shrink()
+    return main()
+
+
+def _kill_at_fsync(number: int) -> None:
+    """This process kills itself at its `number`-th fsync: a file is written and not yet renamed into place."""
+    fsync, calls = os.fsync, count(1)
+
+    def dying(descriptor: Any) -> None:
+        if next(calls) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        fsync(descriptor)
+
+    os.fsync = dying  # type: ignore[assignment]
+
+
+def start(arguments: Sequence[str], folder: Path, datasets: Path, **extra: str) -> subprocess.Popen[str]:
+    """Start `velap arguments` in `folder` with Minari's root `datasets`."""
+    environment = {**os.environ, "MINARI_DATASETS_PATH": str(datasets), "OMP_NUM_THREADS": "1", "COLUMNS": "200",
+                   "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry), **extra}
+    return subprocess.Popen([sys.executable, "-c", CODE, *arguments], cwd=folder, env=environment, text=True,
+                            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def unreadable(folder: Path) -> list[str]:
+    """What is wrong with the files below `folder`; names that begin with a dot are unfinished work and may be anything."""
+    problems = []
+    for path in sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")):
+        try:
+            _read(path)
+        except (VelapError, OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            problems.append(f"{path.relative_to(folder)} is unreadable: {type(error).__name__}")
+    return problems
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Temporary files and folders of unfinished work below `folder`."""
+    return [f"{path.relative_to(folder)} was left behind" for path in sorted(folder.rglob(".*"))]
+
+
+def _read(path: Path) -> None:
+    """Read a file to its end, and check what checksum it has."""
+    from velap.data.minari_io import file_sha256
+    from velap.runs import load_tensors
+
+    if path.suffix == ".safetensors":
+        load_tensors(path)
+    elif path.suffix == ".json":
+        json.loads(path.read_bytes())
+    elif path.suffix == ".jsonl":
+        for line in path.read_text().splitlines():
+            json.loads(line)
+    elif path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as file:
+            for name in file:
+                _ = file[name]
+    elif path.suffix == ".hdf5":
+        stored = json.loads((path.parent / "metadata.json").read_bytes())["velap"]["file_sha256"]
+        if file_sha256(path) != stored:
+            raise ValueError(f"{path} is not what its metadata say")
+
+
+def fingerprint(folder: Path) -> str:
+    """SHA-256 of what a run left: weights, logged losses, dataset arrays; not times, not the command."""
+    from velap.runs import load_tensors
+
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        if path.name == "model.safetensors":
+            tensors, _ = load_tensors(path)
+            for name in sorted(tensors):
+                digest.update(name.encode() + tensors[name].contiguous().numpy().tobytes())
+        elif path.name == "metrics.jsonl":
+            rows = [json.loads(line) for line in path.read_text().splitlines()]
+            digest.update(json.dumps([{k: v for k, v in row.items() if k != "seconds"} for row in rows]).encode())
+        elif path.name == "metadata.json":
+            digest.update(json.loads(path.read_bytes())["velap"]["content_sha256"].encode())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class KillReport:
+    """Outcome of the kills of one command."""
+
+    command: str
+    kills: int
+    problems: tuple[str, ...]
+    fingerprint: str
+    """Of the uninterrupted run, and of every resumed one if there is no problem."""
+
+
+@dataclass(frozen=True)
+class Victim:
+    """A command to kill."""
+
+    arguments: tuple[str, ...]
+    resume: tuple[str, ...]
+    """Arguments that go on with a killed run."""
+    datasets: Path | None
+    """Minari's root; None puts it into each run's own folder."""
+    fsyncs: int
+    """An undisturbed run calls fsync at least so often."""
+
+    def start(self, place: Path, **extra: str) -> subprocess.Popen[str]:
+        """Start it in `place`."""
+        return start(self.arguments, place, self.datasets or place / "datasets", **extra)
+
+    def go_on(self, place: Path) -> subprocess.Popen[str]:
+        """Start it again in `place`, where it was killed."""
+        return start(self.resume, place, self.datasets or place / "datasets")
+
+
+def kill_and_resume(victim: Victim, folder: Path, kills: int, rng: np.random.Generator,
+                    on_kill: Callable[[int], None] = lambda done: None) -> KillReport:
+    """Run the command once to the end, then again and again until it was killed `kills` times, and resume it each time.
+
+    Every other kill falls on a random fsync, the rest on moments uniform over the time from the first file of a run to its
+    end; a run that ends before its moment is repeated with another one. Each works in a folder of its own below `folder`.
+    """
+    whole = folder / "whole"
+    seconds = _time_whole(victim, whole)
+    expected, problems, finished, killed = fingerprint(whole), unreadable(whole) + leftovers(whole), 0, 0
+    while killed < kills and finished <= kills:
+        place = folder / f"run{killed + finished}"
+        place.mkdir(parents=True)
+        if _start_and_kill(victim, place, killed % 2 == 0, seconds, rng):
+            finished += 1
+            continue
+        problems += [f"after kill {killed}: {problem}" for problem in unreadable(place)]
+        resumed = victim.go_on(place)
+        _, errors = resumed.communicate()
+        if resumed.returncode and "exists already" not in errors:
+            problems.append(f"resume {killed} ended with code {resumed.returncode}: {errors.strip()[-300:]}")
+        elif fingerprint(place) != expected:
+            problems.append(f"resume {killed} ended with other bits")
+        problems += [f"after resume {killed}: {problem}" for problem in unreadable(place) + leftovers(place)]
+        killed += 1
+        on_kill(killed)
+    if killed < kills:
+        problems.append(f"{finished} runs ended before they were killed")
+    return KillReport("velap " + " ".join(victim.arguments), killed, tuple(problems), expected)
+
+
+def _start_and_kill(victim: Victim, place: Path, at_fsync: bool, seconds: float, rng: np.random.Generator) -> bool:
+    """Whether the process had finished before it was killed."""
+    if at_fsync:
+        process = victim.start(place, **{KILL_AT: str(rng.integers(1, victim.fsyncs + 1))})
+        process.communicate()
+        return process.returncode >= 0
+    process = victim.start(place)
+    _wait_for_file(process, place)
+    time.sleep(float(rng.uniform(0, seconds)))
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    return process.returncode >= 0
+
+
+def _time_whole(victim: Victim, place: Path) -> float:
+    """Time from the first file to the end of an uninterrupted run [s]."""
+    place.mkdir(parents=True)
+    process = victim.start(place)
+    _wait_for_file(process, place)
+    began = time.monotonic()
+    _, errors = process.communicate()
+    if process.returncode:
+        raise VelapError(f"`velap {' '.join(victim.arguments)}` ended with code {process.returncode}: "
+                         f"{errors.strip()[-500:]}. Expected an undisturbed run to finish; repair that first.")
+    return time.monotonic() - began
+
+
+def _wait_for_file(process: subprocess.Popen[str], place: Path) -> None:
+    """Until the process has written something, or has ended."""
+    while process.poll() is None and not any(path.is_file() for path in place.rglob("*")):
+        time.sleep(0.005)
