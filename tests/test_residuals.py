@@ -29,9 +29,10 @@ def pushed(size: int = 4, moved: float = 0.0) -> Residuals:
 
 def predict(residuals: Residuals, at: float, action: torch.Tensor) -> float:
     alone = residuals.of_row(0)
+    together = residuals.of_rows(tensor([0]))(tensor([[[at]]]), action.unsqueeze(0))
     if alone is not None:
-        torch.testing.assert_close(alone(tensor([[at]]), action), residuals.step(tensor([[[at]]]), action.unsqueeze(0))[0])
-    return residuals.step(tensor([[[at]]]), action.unsqueeze(0)).item()
+        torch.testing.assert_close(alone(tensor([[at]]), action), together[0])
+    return together.item()
 
 
 def test_what_did_not_move_is_expected_to_stay() -> None:
@@ -79,8 +80,9 @@ def test_a_row_forgets_alone_and_the_frame_after_a_reset_teaches_nothing() -> No
     residuals.acted(here, push)
     residuals.forget(tensor([True, False]))
     residuals.observe(here)
-    moved = residuals.step(here.unsqueeze(1), push.unsqueeze(1)).flatten()
+    moved = residuals.of_rows(tensor([0, 1]))(here.unsqueeze(1), push.unsqueeze(1)).flatten()
     assert moved.tolist() == pytest.approx([1.0, 0.0], abs=1e-6)
+    assert residuals.of_rows(tensor([1]))(here[1:].unsqueeze(1), push[1:].unsqueeze(1)).item() == pytest.approx(0, abs=1e-6)
 
 
 def test_another_batch_starts_anew() -> None:
@@ -90,5 +92,5 @@ def test_another_batch_starts_anew() -> None:
     residuals.observe(here)
     residuals.acted(here, push)
     residuals.observe(here + tensor([[1.0], [0.0], [1.0]]))
-    moved = residuals.step(here.unsqueeze(1), push.unsqueeze(1)).flatten()
+    moved = residuals.of_rows(tensor([0, 1, 2]))(here.unsqueeze(1), push.unsqueeze(1)).flatten()
     assert moved.tolist() == pytest.approx([1.0, 0.0, 1.0], abs=1e-6)

@@ -67,11 +67,13 @@ class Residuals:
         self._latents[row, slot], self._actions[row, slot], self._known[row, slot] = latents, actions, 0
         self._taken += 1
 
-    def step(self, latents: Tensor, actions: Tensor) -> Tensor:
-        """h, corrected: `[B, K, D], [B, K, A] → [B, K, D]`."""
-        if not self._known.any():
-            return self._step(latents, actions)
-        return self._corrected(latents, actions, self._latents, self._actions, self._errors, self._known.unsqueeze(1))
+    def of_rows(self, rows: Tensor) -> Step:
+        """h as each of `rows` int64 [P] corrects it for its own queries: `[P, K, D], [P, K, A] → [P, K, D]`."""
+        known = self._known[rows]
+        if not known.any():
+            return self._step
+        memory = self._latents[rows], self._actions[rows], self._errors[rows], known.unsqueeze(1)
+        return lambda latents, actions: self._corrected(latents, actions, *memory)
 
     def of_row(self, row: int) -> Step | None:
         """h as one row corrects it, `[R, D], [R, A] → [R, D]`; None where it has nothing to correct."""

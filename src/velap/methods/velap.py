@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 class VelapAgent:
     """Plans every `n_replan` steps of a row, follows the waypoints by π^l, and hands over to π^g near the goal.
 
-    Rows replan at their own times; those due at one step plan as one batch. A row's randomness is its own generator's, so
-    that the other rows reach it through the rounding of batched arithmetic only.
+    Rows replan at their own times; those due at one step plan as one batch. A row draws from its own generator, and only
+    for what it does itself, so that the other rows reach it through the rounding of batched arithmetic only.
     """
 
     method = "velap"
@@ -137,12 +137,10 @@ class VelapAgent:
         self._steps += 1
 
         # A plan of the root alone leads nowhere, and a row near the goal may have none: π^g acts in both.
-        by_waypoint = ~near_goal & (self._length > 1)
         actions = self._act_global(latents)
-        if by_waypoint.any():
-            rows = torch.arange(len(latents), device=self._device)
-            local = self._act_local(latents, self._waypoints[rows, self._current])
-            actions = torch.where(by_waypoint[:, None], local, actions)
+        rows = torch.nonzero(~near_goal & (self._length > 1)).flatten()
+        if len(rows):
+            actions = actions.index_copy(0, rows, self._act_local(latents[rows], rows).to(actions))
         if led is not None:
             actions = torch.where(led.arrives[:, None], led.actions, actions)
         if self._success_value is not None and self._fns.act_success is not None:
@@ -153,23 +151,24 @@ class VelapAgent:
             self._residuals.acted(latents, actions)
         return self._states.act(actions)
 
-    def _act_local(self, latents: Tensor, waypoints: Tensor) -> Tensor:
-        """π^l towards `waypoints` [B, D], or the best of it and sampled actions under the dynamics: actions [B, A].
+    def _act_local(self, latents: Tensor, rows: Tensor) -> Tensor:
+        """π^l from latents [P, D] of `rows` int64 [P] towards their waypoints: actions [P, A].
 
-        The lookahead is ours: every action is held for a few steps of h and the one whose end reaches the waypoint with
-        the highest Q_min wins.
+        With lookahead (ours) the best of it and of sampled actions: every action is held for a few steps of h, and the one
+        whose end reaches the waypoint with the highest Q_min wins.
         """
+        waypoints = self._waypoints[rows, self._current[rows]]
         policy = self._model.act_local(latents, waypoints)
         if self._lookahead == 0:
             return policy
         shape = (self._samples, self._fns.noise_dim)
-        drawn = [torch.randn(shape, generator=generator) for generator in self._generators]
+        drawn = [torch.randn(shape, generator=self._generators[row]) for row in rows.tolist()]
         noise = torch.stack(drawn).to(latents)
         sampled = self._fns.propose(latents.unsqueeze(1).expand(-1, self._samples, -1), noise)
         actions = torch.cat([policy.unsqueeze(1), sampled], 1)
         if self._gain != 1:
             actions = torch.cat([actions, (self._gain * actions).clamp(-1, 1)], 1)
-        step = self._fns.step if self._residuals is None else self._residuals.step
+        step = self._fns.step if self._residuals is None else self._residuals.of_rows(rows)
         ends = self._held(latents, actions, step, self._lookahead)
         q_min, _ = self._fns.reach(ends, waypoints.unsqueeze(1).expand_as(ends))
         return actions[torch.arange(len(actions), device=actions.device), q_min.argmax(1)]

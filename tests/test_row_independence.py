@@ -1,0 +1,89 @@
+"""An episode is the same whatever episodes share its batch, also where their rows do other things at the same step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from test_agents import round_the_wall
+from toy_env import SIDE, ToyEnv, ToyModel, draw, toy_config
+from velap.config import override
+from velap.evaluation.rollout import FrameReader, Rollout
+from velap.methods.velap import VelapAgent
+
+STARTS = ((-6.0, 0.0), (-3.0, -7.0), (1.5, 0.5), (-1.0, 7.0), (4.0, -8.0), (-8.0, 5.0), (9.0, 3.0), (-6.0, -1.0))
+"""Where the episode of each seed begins: far behind the wall, near the goal, and where a cloned policy arrives."""
+STEPS = 25
+
+
+class RecordingEnv(ToyEnv):
+    """The toy world from the seed's start; keeps the actions of every episode."""
+
+    def __init__(self, actions: dict[int, list[np.ndarray]]) -> None:
+        super().__init__()
+        self.actions, self.seed = actions, -1
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        assert seed is not None
+        super().reset(seed=seed)
+        self.seed, self.position = seed, np.array(STARTS[seed])
+        self.actions[seed] = []
+        return draw(self.position), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.actions[self.seed].append(action)
+        return super().step(action)
+
+
+class UpwardsModel(ToyModel):
+    """The toy model with a held policy, which moves up."""
+
+    def __init__(self, **changes: object) -> None:
+        super().__init__(**changes)
+        self.held_policy = lambda latent: latent.new_tensor([0.0, 1.0]).expand_as(latent)
+
+
+def actions_of(agent: VelapAgent, seeds: tuple[int, ...], batch: int) -> tuple[dict[int, np.ndarray], set[tuple[bool, ...]]]:
+    """The actions [steps, A] of every episode, and what rows did at one step: planned, were near the goal, were led."""
+    taken: dict[int, list[np.ndarray]] = {}
+    modes: set[tuple[bool, ...]] = set()
+
+    def watch(row: int, seed: int, env: gym.Env[Any, Any], acting: object, outcome: object) -> None:
+        following = len(agent.waypoints_ahead(row)) > 0 and not agent.near_goal[row]
+        modes.add((bool(row in agent.planned_rows), bool(agent.near_goal[row]), bool(agent.led_by_success[row]), following))
+
+    envs: list[gym.Env[Any, Any]] = [RecordingEnv(taken) for _ in range(batch)]
+    rollout = Rollout(envs, agent, FrameReader(envs[0], SIDE, None), max_steps=STEPS, observer=watch)
+    assert {episode.seed for episode in rollout.run(seeds)} == set(seeds)
+    return {seed: np.stack(actions) for seed, actions in taken.items()}, modes
+
+
+@pytest.mark.parametrize("controller", [
+    {},
+    {"residuals": 10},
+    {"revisit_penalty": 0.3},
+    {"success_rollout": 15, "goal_lookahead": 2},
+    {"success_exponent": 3.0, "shortcut_exponent": 4.0, "held_turn": 3},
+], ids=lambda controller: "-".join(controller) or "algorithm-2")
+def test_every_episode_takes_the_same_actions_in_any_batch(controller: dict[str, Any]) -> None:
+    in_turns = "held_turn" in controller
+    config = override(toy_config(n_iter=40), controller={"n_replan": 5, **controller},
+                      model={"success_policy": True, "held_policy": in_turns})
+
+    def agent() -> VelapAgent:
+        model = UpwardsModel if in_turns else ToyModel
+        return VelapAgent(model(act_success=round_the_wall), config)  # type: ignore[arg-type]
+
+    every = tuple(range(len(STARTS)))
+    alone: dict[int, np.ndarray] = {}
+    for seed in every:
+        alone |= actions_of(agent(), (seed,), 1)[0]
+    assert max(len(actions) for actions in alone.values()) > 5, "some episode plans more than once"
+    for seeds, batch in ((every, 8), (every[::-1], 3), ((2, 0, 6, 1, 2), 2)):
+        together, modes = actions_of(agent(), seeds, batch)
+        assert len(modes) >= 3, f"rows did the same all the time: {modes}"
+        for seed, actions in together.items():
+            np.testing.assert_allclose(actions, alone[seed], atol=1e-5, err_msg=f"seed {seed} in {seeds}, {batch} at once")
