@@ -152,7 +152,7 @@ def test_the_clone_acts_near_the_goal_and_the_held_policy_before():
     settings = override(toy_config(n_iter=20), model={"success_policy": True},
                         controller={"stop_exponent": 6.0, "success_exponent": 3.0})
     places = [np.array(GOAL) + offset for offset in ([-2.0, 0.0], [-4.5, 0.0])]
-    frames = np.stack([draw(place)[None] for place in places])
+    frames = np.stack([[draw(place)] * 2 for place in places])
     model = ToyModel(act_success=away)
     agent = VelapAgent(model, settings)
     toward = agent.act(frames)
@@ -167,7 +167,7 @@ def test_revisits_do_not_take_the_lead_from_the_clone_before_they_call_for_a_pla
     settings = override(toy_config(n_iter=20), model={"success_policy": True},
                         controller={"stop_exponent": 6.0, "success_exponent": 3.0, "revisit_penalty": 1.0})
     agent = VelapAgent(ToyModel(act_success=lambda z: torch.full_like(z, -0.5)), settings)
-    frames, led, planned = draw(np.array(GOAL) - [2.0, 0.0])[None, None], [], []
+    frames, led, planned = np.stack([[draw(np.array(GOAL) - [2.0, 0.0])] * 2]), [], []
     for _ in range(12):
         agent.act(frames)
         led.append(bool(agent.led_by_success[0]))
@@ -182,7 +182,7 @@ def test_the_held_policy_and_the_global_one_take_turns():
                         controller={"stop_exponent": 90.0, "held_turn": 2})
     model = ToyModel()
     model.held_policy = lambda z: z.new_tensor([0.0, -0.5]).expand_as(z)
-    agent, frames = VelapAgent(model, settings), np.stack([draw(np.array(GOAL) - [3.0, 0.0])[None]] * 2)
+    agent, frames = VelapAgent(model, settings), np.stack([[draw(np.array(GOAL) - [3.0, 0.0])] * 2] * 2)
     assert agent.leader == "held or global policy" and VelapAgent(ToyModel(), toy_config()).leader == "global policy"
     down = []
     for step in range(7):

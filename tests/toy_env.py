@@ -17,6 +17,7 @@ from velap.config import Config, ModelConfig, override
 from velap.evaluation.evaluate import Player
 from velap.evaluation.records import RunKey
 from velap.methods.base import make_agent
+from velap.models.velap import Spaces
 
 SIDE = 8
 ACTION_SCALE = 2.0
@@ -82,7 +83,8 @@ class ToyModel(nn.Module):
         self.held_policy = None
         self.encoded_batches: list[int] = []
 
-    action_dim, config = 2, ModelConfig()
+    action_dim, config = 2, ModelConfig(frame_stack=2)
+    spaces = Spaces(SIDE, SIDE, (-ACTION_SCALE,) * 2, (ACTION_SCALE,) * 2)
 
     def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
         self.encoded_batches.append(len(frames))

@@ -20,6 +20,10 @@ class DatasetError(VelapError, ValueError):
     """A dataset cannot be read or does not hold what training needs."""
 
 
+class ObservationError(VelapError, ValueError):
+    """Frames or an observation are not of the kind that a model was trained on."""
+
+
 class CheckpointError(VelapError, ValueError):
     """A checkpoint is unreadable, damaged, foreign or does not fit the model."""
 

@@ -56,6 +56,7 @@ class PlanningAgent(ABC):
     @torch.inference_mode()
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Frames [B, N, H, W, 3] -> actions [B, A]."""
+        frames = self._states.checked(frames)
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
         latents = self._states(frames)

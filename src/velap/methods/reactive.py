@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from velap.methods.base import masked_seeds
-from velap.methods.states import StateEncoder
+from velap.methods.states import StateEncoder, checked_frames
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
@@ -40,7 +40,8 @@ class RandomAgent:
             self._generators[row] = np.random.default_rng(seed)
 
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Uniform actions [B, A]; of the frames only the number counts."""
+        """Uniform actions [B, A]; of the frames [B, N, H, W, 3] only the number counts, H and W are any."""
+        frames = checked_frames(frames, self.frame_stack)
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
         draws = [generator.uniform(self._low, self._high) for generator in self._generators]
@@ -65,6 +66,7 @@ class ReactiveAgent:
     @torch.inference_mode()
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Frames [B, N, H, W, 3] -> actions [B, A]."""
+        frames = self._states.checked(frames)
         if len(frames) != len(self.last_plan_ms):
             self.reset(np.ones(len(frames), bool))
         return self._states.act(self._policy(self._states(frames)))

@@ -119,6 +119,7 @@ class VelapAgent:
     @torch.inference_mode()
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """One step of Algorithm 2: frames [B, N, H, W, 3] -> actions [B, A]."""
+        frames = self._states.checked(frames)
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
         latents = self._states(frames)
