@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from toy_world import DISCOUNT, reach, roots, row_generators, toy_fns
 from velap.config.planning import PlannerConfig
+from velap.search import expansion
 from velap.search.est import plan
 from velap.search.tree import Candidates, free_slots, insert_, new_tree, take, trace_back, trimmed
 
@@ -61,6 +65,14 @@ def test_take_gathers_rows_of_each_batch() -> None:
     assert take(rows, torch.tensor([[[2]], [[0]]])).shape == (2, 1, 1, 2)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compare_with_every_node() -> Iterator[None]:
+    """As the paper does: with no more than MAX_NEIGHBOURS inside d_neigh that makes no difference, here there are more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(expansion, "MAX_NEIGHBOURS", 1000)
+        yield
+
+
 def one_way_reach(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Down is slower than up: Q^{i,j} and Q^{j,i} differ."""
     q, std = reach(start, end)
@@ -77,7 +89,7 @@ def test_trees_keep_their_properties(
 ) -> None:
     cfg = PlannerConfig(
         n_iter=n_iter, candidates=candidates, n_sim=n_sim, coherent_noise=coherent, p_policy=p_policy,
-        max_neighbours=n_iter + 1, discard_high_exponent=high, discard_low_exponent=n_sim + 1.0, goal_exponent=9.0,
+        discard_high_exponent=high, discard_low_exponent=n_sim + 1.0, goal_exponent=9.0,
     )
     fns = toy_fns(reach=one_way_reach)
     found = plan(fns, roots(2, spread=5.0, seed=seed), cfg, row_generators(2, seed))

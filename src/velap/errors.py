@@ -10,7 +10,7 @@ class ConfigError(VelapError, ValueError):
 
 
 class UnknownTaskError(VelapError, KeyError):
-    """No task, method or preset of that name is registered."""
+    """No task, method, planner, encoder, reader or preset of that name is registered."""
 
     def __str__(self) -> str:
         return str(self.args[0]) if self.args else ""

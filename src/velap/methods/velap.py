@@ -21,12 +21,14 @@ from velap.methods.successes import SuccessRollouts
 from velap.models.arrivals import GAINS
 from velap.models.horizon import q_from_steps
 from velap.search.est import plan
-from velap.search.rehearsal import rehearse
 from velap.search.types import Plan, SearchFns
 
 if TYPE_CHECKING:
     from velap.config import Config
     from velap.models.velap import LatentModel
+
+SAMPLES = 32
+"""Actions drawn from g for the lookahead. ours."""
 
 
 class VelapAgent:
@@ -57,7 +59,7 @@ class VelapAgent:
         self._fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
         self._planner = config.planner
         self._n_replan = config.controller.n_replan
-        self._lookahead, self._samples = config.controller.lookahead, config.controller.lookahead_samples
+        self._lookahead = config.controller.lookahead
         self._gain, self._goal_lookahead = config.controller.lookahead_gain, config.controller.goal_lookahead
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._turn = config.controller.held_turn
@@ -67,7 +69,6 @@ class VelapAgent:
             self.leader = "held or global policy" if self._turn else "held policy"
         close = config.controller.success_exponent
         self._success_value = q_from_steps(close, self._fns.discount) if close > 0 else None
-        self._waypoint_exponent = config.controller.waypoint_exponent
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
         shortcut = config.controller.shortcut_exponent
         self._shortcut_value = q_from_steps(shortcut, self._fns.discount) if shortcut > 0 else None
@@ -162,10 +163,10 @@ class VelapAgent:
         policy = self._model.act_local(latents, waypoints)
         if self._lookahead == 0:
             return policy
-        shape = (self._samples, self._fns.noise_dim)
+        shape = (SAMPLES, self._fns.noise_dim)
         drawn = [torch.randn(shape, generator=self._generators[row]) for row in rows.tolist()]
         noise = torch.stack(drawn).to(latents)
-        sampled = self._fns.propose(latents.unsqueeze(1).expand(-1, self._samples, -1), noise)
+        sampled = self._fns.propose(latents.unsqueeze(1).expand(-1, SAMPLES, -1), noise)
         actions = torch.cat([policy.unsqueeze(1), sampled], 1)
         if self._gain != 1:
             actions = torch.cat([actions, (self._gain * actions).clamp(-1, 1)], 1)
@@ -231,8 +232,6 @@ class VelapAgent:
         start = time.perf_counter()
         generators = [self._generators[row] for row in planned]
         result = plan(fns, latents[rows], self._planner, generators)
-        if self._planner.rehearsals > 0:
-            result = rehearse(fns, result, self._planner, self._waypoint_exponent, generators)
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         self.last_plan_ms[planned] = (time.perf_counter() - start) * 1e3 / len(planned)

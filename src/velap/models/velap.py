@@ -221,7 +221,6 @@ class LatentModel(nn.Module):
         return {
             "propose": lambda latent, noise: decoder(latent, noise).tanh_(),
             "act_global": act_global,
-            "act_local": act_local,
             "act_success": None if cloned is None else lambda latent: cloned(latent).tanh_(),
             "step": step,
             "reach": reach,

@@ -20,6 +20,12 @@ from velap.search.sampling import Noise, node_distribution, sample_nodes
 from velap.search.tree import Candidates, free_slots, insert_, take
 from velap.search.types import SearchFns, Tree
 
+MAX_NEIGHBOURS = 16
+"""M, nearest tree nodes that a candidate is compared with inside d_neigh. ours: the paper compares with all of them, which
+is the same as long as no more than M lie within d_neigh."""
+ANCHOR_FACTOR = 1.0
+"""Largest distance of a candidate to a dataset latent, in upper 5-percentiles of one-step distances. ours."""
+
 
 class Thresholds(NamedTuple):
     """Table 8 for one model: scalars [] [Q-value]."""
@@ -100,7 +106,7 @@ def anchored(fns: SearchFns, z: Tensor, cfg: PlannerConfig) -> tuple[Tensor, Ten
         raise ConfigError(f"config field `anchor` is {cfg.anchor!r}, but the model keeps no dataset latents; "
                           "expected 'none'. Train with `bank_size` above 0 or set `anchor` to 'none'.")
     nearest, distance = fns.project(z)
-    return (nearest if cfg.anchor == "snap" else z), distance <= cfg.anchor_factor * fns.step_distance
+    return nearest, distance <= ANCHOR_FACTOR * fns.step_distance
 
 
 class _Pairs(NamedTuple):
@@ -114,8 +120,8 @@ class _Pairs(NamedTuple):
     """[B, K, S] bool: within d_neigh, in use and, among candidates, earlier in the round."""
 
 
-def _candidate_neighbours(latents: Tensor, used: Tensor, z: Tensor, d_neigh: float, most: int) -> _Pairs:
-    """Used [B, n] nodes of latents [B, n, D] within d_neigh of z [B, K, D] (App. B.6), the `most` nearest, and candidates.
+def _candidate_neighbours(latents: Tensor, used: Tensor, z: Tensor, d_neigh: float) -> _Pairs:
+    """Used [B, n] nodes of latents [B, n, D] within d_neigh of z [B, K, D] (App. B.6), the M nearest, and candidates.
 
     Squared distances come from one product, less |z|², which does not change who is nearest.
     """
@@ -126,7 +132,7 @@ def _candidate_neighbours(latents: Tensor, used: Tensor, z: Tensor, d_neigh: flo
     bound = d_neigh**2 - norms[:, nodes:].unsqueeze(-1)
     norms[:, :nodes].masked_fill_(~used, torch.inf)
     distance = torch.baddbmm(norms.unsqueeze(1), z, pool.mT, alpha=-2)
-    nearest, index = distance[:, :, :nodes].topk(min(most, nodes), largest=False, sorted=False)
+    nearest, index = distance[:, :, :nodes].topk(min(MAX_NEIGHBOURS, nodes), largest=False, sorted=False)
     others = torch.arange(nodes, nodes + count, device=z.device).expand(batch, count, count)
     earlier = (distance[:, :, nodes:] <= bound).tril_(-1)
     return _Pairs(pool, torch.cat([index, others], 2), torch.cat([nearest <= bound, earlier], 2))
@@ -185,7 +191,7 @@ def expand_(tree: Tree, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, 
     q_edge, std_edge = fns.reach(z_parent, z)
 
     feasible = (q_edge > limits.low) & (q_edge < limits.high) & (std_edge < limits.std) & supported
-    pairs = _candidate_neighbours(tree.latents[:, :slots], used, z, fns.d_neigh, cfg.max_neighbours)
+    pairs = _candidate_neighbours(tree.latents[:, :slots], used, z, fns.d_neigh)
     from_parent = pairs.near & (pairs.rows == parents.unsqueeze(-1))
     q_in = _reach_where(fns, pairs, z, pairs.near & feasible.unsqueeze(-1) & ~from_parent, incoming=True)
     q_in = torch.where(from_parent, q_edge.unsqueeze(-1), q_in)

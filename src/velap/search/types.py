@@ -42,8 +42,6 @@ class SearchFns(NamedTuple):
     """Upper 5-percentile of the distances between subsequent encodings [latent distance]."""
     project: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None
     """Latents [*, D] → nearest dataset latent [*, D] and its distance [*]; None where the model keeps no bank."""
-    act_local: Callable[[Tensor, Tensor], Tensor] | None = None
-    """π^l: from [*, D], to [*, D] → actions [*, A] in [-1, 1]; None where nothing is rehearsed."""
     act_success: Callable[[Tensor], Tensor] | None = None
     """The policy cloned from successes: latents [*, D] → actions [*, A] in [-1, 1]; None where the model has none (ours)."""
     rollout: Callable[[Tensor, Tensor | None, int], Tensor] | None = None
@@ -55,7 +53,7 @@ class Rejections(NamedTuple):
     """Candidates that a plan rejected, int64 [B] each, by the first reason that held; n_iter less `tree.size - 1` in all."""
 
     unsupported: Tensor
-    """Farther than `anchor_factor` one-step distances from every dataset latent (ours)."""
+    """Farther than `ANCHOR_FACTOR` one-step distances from every dataset latent (ours)."""
     low: Tensor
     """Q_min^{exp,new} is not above τ_low: too far from the node it was expanded from (Alg. 1, line 13)."""
     std: Tensor

@@ -173,7 +173,7 @@ def _tree_advice(numbers: Sequence[TreeNumbers]) -> str:
     totals = {name: sum(each.rejected[name] for each in numbers) for name in Rejections._fields}
     commonest = max(totals, key=lambda name: totals[name])
     advice = {
-        "unsupported": "most candidates leave the data: raise planner.anchor_factor or improve the dynamics",
+        "unsupported": "most candidates leave the data: improve the dynamics, or set planner.anchor to none",
         "low": "most candidates are called too far from their parent: raise planner.discard_low_exponent, or check Q^l",
         "std": "the ensemble disagrees on most candidates: raise planner.discard_std, or train longer",
         "high": "most candidates are near a node already: the reachable space is full, or Q^l takes different states for "
