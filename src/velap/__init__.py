@@ -9,11 +9,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from velap._version import __version__
+from velap.registry import register_encoder, register_method, register_planner, register_reader, register_task
 
 if TYPE_CHECKING:
     from velap.api import evaluate, load, make_dataset, train
 
-__all__ = ["__version__", "evaluate", "load", "make_dataset", "train"]
+__all__ = [
+    "__version__", "evaluate", "load", "make_dataset", "register_encoder", "register_method", "register_planner",
+    "register_reader", "register_task", "train",
+]
 
 
 def __getattr__(name: str) -> Any:
