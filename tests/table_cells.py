@@ -22,12 +22,14 @@ def inventory(episodes: int = 4) -> Inventory:
 def fill(cell: Cell, outcomes: Sequence[bool], *, config_hash: str | None = None, checkpoint: str = "c0ffee",
          code: str = "0.1.0+gabc", plan_ms: tuple[float, ...] = (10.0, 30.0)) -> Path:
     """A record file of the cell, an episode an outcome; returns its path."""
-    key = RunKey(cell.task, cell.method, cell.preset, cell.seed, get_task(cell.task).env_id,
-                 config_hash or str(inventory().expected_hash(cell)), checkpoint, code)
+    task = get_task(cell.task)
+    key = RunKey(task=cell.task, method=cell.method, preset=cell.preset, train_seed=cell.seed, env=task.env_id,
+                 config_hash=config_hash or str(inventory().expected_hash(cell)), checkpoint=checkpoint, code_version=code,
+                 max_steps=task.max_steps)
     with RecordFile(key.path(RECORDS), key) as file:
         for seed, success in enumerate(outcomes):
             file.append(Record(**vars(key), episode_seed=seed, success=success, steps=100 if success else 300,
-                               truncated=not success, plan_ms=plan_ms))
+                               truncated=not success, plan_ms=plan_ms, batch=1, device="cpu"))
     return key.path(RECORDS)
 
 

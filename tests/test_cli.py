@@ -123,7 +123,7 @@ def test_every_set_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_evaluation_goes_on_where_it_stopped(capsys: pytest.CaptureFixture[str]) -> None:
-    path = Path("results/records/SpiralMaze/random-default/train0.jsonl")
+    path = Path("runs/records/SpiralMaze/random-default/train0.jsonl")
     assert cli.main([*RANDOM, "--episodes", "2"]) == 0
     first = path.read_bytes()
     assert cli.main([*RANDOM, "--episodes", "3", "--batch", "1"]) == 0
@@ -149,7 +149,7 @@ def test_records_name_the_checkpoint_and_refuse_another(tmp_path: Path, capsys: 
     command = ["evaluate", "SpiralMaze", "--episodes", "1", "--max-steps", "3", "--checkpoint"]
     checkpoint = untrained(tmp_path / "a.safetensors")
     assert cli.main([*command, str(checkpoint)]) == 0
-    path = Path("results/records/SpiralMaze/velap-default/train3.jsonl")
+    path = Path("runs/records/SpiralMaze/velap-default/train3.jsonl")
     (record,) = read_records(path)
     assert re.fullmatch("[0-9a-f]{64}", record.checkpoint)
     assert re.fullmatch("[0-9a-f]{12}", record.config_hash)
@@ -188,10 +188,97 @@ def test_any_gymnasium_environment_and_a_video(tmp_path: Path, capsys: pytest.Ca
     checkpoint = untrained(tmp_path / "toy.safetensors", task="toys")
     command = ["evaluate", "toys", "--env", "toy_env:Toy-v0", "--checkpoint", str(checkpoint), "--episodes", "1"]
     assert cli.main([*command, "--method", "td3bc", "--max-steps", "3", "--video"]) == 0
-    (path,) = Path("results/records").rglob("*.jsonl")
+    (path,) = Path("runs/records").rglob("*.jsonl")
     assert path.parts[2] == "toy_env_Toy-v0"
     assert read_records(path)[0].env == "toy_env:Toy-v0"
     assert Path("runs/videos/toy_env_Toy-v0/td3bc-default/train3/episode0.mp4").stat().st_size > 1000
+
+
+MINE = """
+import gymnasium as gym, numpy as np
+
+class Mine(gym.Env):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, render_mode=None, obs_type="state", win=0.0):
+        self.render_mode, self.win = render_mode, win
+        picture, state = gym.spaces.Box(0, 255, (64, 64, 3), np.uint8), gym.spaces.Box(-1, 1, (2,))
+        self.observation_space = gym.spaces.Dict(front=picture, wrist=picture) if obs_type == "pixels" else state
+
+    def observe(self):
+        return {"front": self.picture(), "wrist": 255 - self.picture()}
+
+    def picture(self):
+        return np.full((64, 64, 3), 10 * self.t, np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self.observe(), self.win if self.t == 5 else self.win - 1, self.t == 5, False, {}
+
+    def render(self):
+        return self.picture() if self.render_mode == "rgb_array" else None
+
+gym.register("Mine-v0", "own_robot:Mine", max_episode_steps=20)
+"""
+"""A stranger's environment: pixels for an argument only, two cameras, a picture in its render mode only, -1 a step, 0 at the
+goal."""
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    (tmp_path / "own_robot.py").write_text(MINE)
+    monkeypatch.syspath_prepend(tmp_path)
+    return ["evaluate", "mine", "--env", "own_robot:Mine-v0", "--method", "random", "--episodes", "1"]
+
+
+def test_an_environment_gets_its_arguments(mine: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*mine, "--env-kwargs", "colour=red"]) == 2
+    assert "give them with --env-kwargs NAME=VALUE" in capsys.readouterr().err
+    assert cli.main([*mine, "--env-kwargs", "obs_type"]) == 2
+    assert "--env-kwargs got 'obs_type'; expected NAME=VALUE" in capsys.readouterr().err
+    assert cli.main(mine) == 2
+    assert "with the argument that gives pixels, such as --env-kwargs" in capsys.readouterr().err
+    mine += ["--env-kwargs", "obs_type=pixels", "win=1.0", "--image-key", "front"]
+    assert cli.main(mine) == 0
+    (path,) = Path("runs/records").rglob("*.jsonl")
+    (record,) = read_records(path)
+    assert (record.success, record.steps, record.max_steps) == (True, 5, 20)
+    assert (record.env_kwargs, record.image_key) == ({"obs_type": "pixels", "win": 1.0}, "front")
+    assert (record.batch, record.device, record.schema) == (1, "cpu", 2)
+    for changed in (["--image-key", "wrist"], ["--max-steps", "5"], ["--success-reward", "0.5"]):
+        assert cli.main([*mine, *changed]) == 2
+        assert "holds records of another run" in capsys.readouterr().err
+    assert cli.main([*mine, "--image-key", "side"]) == 2
+    assert "side" in capsys.readouterr().err
+    assert read_records(path) == [record]
+
+
+def test_where_every_step_costs_success_has_to_be_said(mine: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    mine += ["--env-kwargs", "obs_type=pixels", "--image-key", "front"]
+    assert cli.main(mine) == 2
+    assert "--success-reward 0" in capsys.readouterr().err
+    assert cli.main([*mine, "--success-reward", "0", "--video"]) == 0
+    (path,) = Path("runs/records").rglob("*.jsonl")
+    assert [(record.success, record.steps) for record in read_records(path)] == [(True, 5)]
+    (video,) = Path("runs/videos").rglob("*.mp4")
+    assert video.stat().st_size > 1000, "made in the render mode that draws"
+
+
+def test_own_records_never_meet_the_shipped_ones(tmp_path: Path) -> None:
+    shipped = Path("results/records/SpiralMaze/velap-default/train3.jsonl")
+    shipped.parent.mkdir(parents=True)
+    shipped.write_bytes((ROOT / "results/records/SpiralMaze/velap-default/train0.jsonl").read_bytes())
+    before = shipped.read_bytes()
+    assert cli.main(["evaluate", "SpiralMaze", "--episodes", "1", "--max-steps", "3", "--checkpoint",
+                     str(untrained(tmp_path / "a.safetensors"))]) == 0
+    assert shipped.read_bytes() == before
+    assert len(read_records(Path("runs/records/SpiralMaze/velap-default/train3.jsonl"))) == 1
 
 
 def test_info_names_tasks_and_versions(capsys: pytest.CaptureFixture[str]) -> None:
@@ -224,7 +311,7 @@ def test_the_readme_quickstart_and_the_command_line_agree(capsys: pytest.Capture
     assert "Summary(task='SpiralMaze', method='velap', preset='default', train_seed=0, episodes=1" in capsys.readouterr().out
 
     assert velap.make_dataset("SpiralMaze", seed=0) == names["dataset"], "there already"
-    records = Path("results/records/SpiralMaze/velap-default/train0.jsonl")
+    records = Path("runs/records/SpiralMaze/velap-default/train0.jsonl")
     before = read_records(records)
     assert cli.main(["run", "SpiralMaze", "--episodes", "1"]) == 0
     assert read_records(records) == before, "the run is finished: nothing is left to do"

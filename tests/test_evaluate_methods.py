@@ -50,7 +50,7 @@ def evaluate(*arguments: object) -> int:
 
 
 def records_of(method: str) -> Path:
-    return Path(f"results/records/SpiralMaze/{method}-default/train0.jsonl")
+    return Path(f"runs/records/SpiralMaze/{method}-default/train0.jsonl")
 
 
 def test_the_head_beside_the_checkpoint_is_found_or_named(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,13 +15,17 @@ from pathlib import Path
 import pytest
 
 from velap.errors import RecordError, StorageError
-from velap.evaluation.records import Record, RecordFile, RunKey, read_records, select
+from velap.evaluation.records import Record, RecordFile, RunKey, read_all, read_records, select
+from velap.storage import SHIPPED_RECORDS
+from velap.tasks import TASKS
 
-KEY = RunKey("Maze", "velap", "default", 0, "velap/Maze-v0", "abc", "c0ffee", "0.1.0")
+KEY = RunKey(task="Maze", method="velap", preset="default", train_seed=0, env="velap/Maze-v0", config_hash="abc",
+             checkpoint="c0ffee", code_version="0.1.0", max_steps=300)
 
 
 def record(seed: int, success: bool = True, steps: int = 10) -> Record:
-    return Record(**vars(KEY), episode_seed=seed, success=success, steps=steps, truncated=not success, plan_ms=(1.5, 2.25))
+    return Record(**vars(KEY), episode_seed=seed, success=success, steps=steps, truncated=not success, plan_ms=(1.5, 2.25),
+                  batch=1, device="cpu")
 
 
 def filled(path: Path, count: int) -> bytes:
@@ -108,25 +113,73 @@ def test_a_seed_counts_once(tmp_path: Path) -> None:
         read_records(path)
 
 
-@pytest.mark.parametrize("field", ["config_hash", "checkpoint", "env"])
-def test_records_of_another_run_are_not_mixed(tmp_path: Path, field: str) -> None:
+@pytest.mark.parametrize(("field", "value"), [
+    ("config_hash", "other"), ("checkpoint", "other"), ("env", "other"), ("image_key", "wrist"), ("max_steps", 5),
+    ("success_reward", 0.0), ("env_kwargs", {"size": 96})])
+def test_records_of_another_run_are_not_mixed(tmp_path: Path, field: str, value: object) -> None:
     path = tmp_path / "r.jsonl"
     old = filled(path, 2)
-    other = dataclasses.replace(KEY, **{field: "other"})
-    with pytest.raises(RecordError, match=rf"`{field}` is .* there and 'other' here\. Give --fresh"):
+    other = dataclasses.replace(KEY, **{field: value})
+    with pytest.raises(RecordError, match=rf"`{field}` is .* there and {re.escape(repr(value))} here\. Give --fresh"):
         RecordFile(path, other)
     for number in (1, 2):
         with RecordFile(path, other, fresh=True) as file:
             assert file.done == set()
-            file.append(dataclasses.replace(record(0), **{field: "other"}))
+            file.append(dataclasses.replace(record(0), **{field: value}))
         assert (tmp_path / f"r.jsonl.old-{number}").exists()
     assert (tmp_path / "r.jsonl.old-1").read_bytes() == old
 
 
-def test_another_code_version_may_go_on(tmp_path: Path) -> None:
+def test_another_code_version_batch_or_device_may_go_on(tmp_path: Path) -> None:
     filled(tmp_path / "r.jsonl", 1)
     with RecordFile(tmp_path / "r.jsonl", dataclasses.replace(KEY, code_version="0.1.1")) as file:
         assert file.done == {0}
+        file.append(dataclasses.replace(record(1), code_version="0.1.1", batch=8, device="NVIDIA H100"))
+    assert [(r.batch, r.device) for r in read_records(tmp_path / "r.jsonl")] == [(1, "cpu"), (8, "NVIDIA H100")]
+
+
+def schema_1(env: str, steps: int, truncated: bool) -> bytes:
+    """A line as velap wrote it before it noted camera, time limit, batch and device."""
+    return json.dumps({
+        "task": "SpiralMaze", "method": "velap", "preset": "default", "train_seed": 0, "env": env, "config_hash": "abc",
+        "checkpoint": "c0ffee", "code_version": "0.1.0", "episode_seed": 0, "success": not truncated, "steps": steps,
+        "truncated": truncated, "plan_ms": [1.5]}).encode() + b"\n"
+
+
+@pytest.mark.parametrize(("env", "steps", "truncated", "limit"), [
+    ("velap/SpiralMaze-v0", 177, False, 300), ("velap/SpiralMaze-v0", 300, True, 300), ("velap/SpiralMaze-v0", 4, True, 4),
+    ("robot:Robot-v0", 20, True, 20), ("robot:Robot-v0", 7, False, None)])
+def test_schema_1_is_migrated_and_goes_on_where_its_time_limit_is_known(tmp_path: Path, env: str, steps: int,
+                                                                        truncated: bool, limit: int | None) -> None:
+    path = tmp_path / "r.jsonl"
+    path.write_bytes(schema_1(env, steps, truncated))
+    (old,) = read_records(path)
+    assert (old.schema, old.max_steps) == (1, limit)
+    assert (old.env_kwargs, old.image_key, old.batch, old.device) == ({}, None, None, None)
+    key = dataclasses.replace(KEY, task="SpiralMaze", env=env, max_steps=limit or 20)
+    if limit is None:
+        with pytest.raises(RecordError, match="`max_steps` is None there and 20 here"):
+            RecordFile(path, key)
+    else:
+        with RecordFile(path, key) as file:
+            assert file.done == {0}
+        with pytest.raises(RecordError, match="`image_key` is None there and 'wrist' here"):
+            RecordFile(path, dataclasses.replace(key, image_key="wrist"))
+    assert path.read_bytes() == schema_1(env, steps, truncated), "read, not rewritten"
+
+
+def test_a_newer_schema_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.jsonl"
+    path.write_text(json.dumps({**json.loads(filled(path, 1)), "schema": 3}) + "\n")
+    with pytest.raises(RecordError, match="schema 3 of a newer velap"):
+        read_records(path)
+
+
+def test_every_shipped_record_is_read_with_the_time_limit_of_its_task() -> None:
+    files = read_all(Path(__file__).resolve().parents[1] / SHIPPED_RECORDS)
+    assert len(files) >= 82
+    for path, records in files.items():
+        assert {record.max_steps for record in records} == {TASKS[records[0].task].max_steps}, path
 
 
 def test_a_second_writer_is_refused(tmp_path: Path) -> None:

@@ -91,6 +91,19 @@ def test_success_is_the_environments_word(reward: float, info: dict[str, Any], e
     assert succeeded(reward, info) is expected
 
 
+@pytest.mark.parametrize(("reward", "least", "expected"), [(-1.0, 0.0, False), (0.0, 0.0, True), (0.1, 1.0, False),
+                                                           (1.0, 1.0, True)])
+def test_success_is_a_reward_of_at_least_what_is_said(reward: float, least: float, expected: bool) -> None:
+    assert succeeded(reward, {}, least) is expected
+    assert succeeded(reward, {"success": not expected}, least) is not expected, "what the environment says comes first"
+
+
+def test_a_negative_reward_does_not_tell_what_success_is() -> None:
+    with pytest.raises(ConfigError, match="--success-reward 0"):
+        succeeded(-1.0, {})
+    assert succeeded(-1.0, {"is_success": True}) is True
+
+
 class Foreign(gym.Env[Any, Any]):
     """Channel-first grey images under a key, 16 pixels wide."""
 

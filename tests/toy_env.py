@@ -127,9 +127,11 @@ def toy_env() -> gym.Env[Any, Any]:
 def toy_player(max_steps: int = 60, n_iter: int = 300) -> Player:
     """VELAP in the toy world."""
     model, config = ToyModel(), toy_config(n_iter=n_iter)
-    key = RunKey("toy", "velap", "default", 0, "toy-v0", "0" * 12, "", "test")
+    key = RunKey(task="toy", method="velap", preset="default", train_seed=0, env="toy-v0", config_hash="0" * 12,
+                 checkpoint="", code_version="test", max_steps=max_steps)
     agent = make_agent("velap", model, config, ToyEnv().action_space)  # type: ignore[arg-type]
-    return Player(agent, model, config, key, toy_env, SIDE, None, max_steps)  # type: ignore[arg-type]
+    return Player(agent=agent, model=model, config=config, key=key, make_env=toy_env,  # type: ignore[arg-type]
+                  image_size=SIDE)
 
 
 gym.register("Toy-v0", ToyEnv, max_episode_steps=60)

@@ -18,16 +18,13 @@ import numpy as np
 
 from velap.config import Config, override
 from velap.errors import ConfigError
-from velap.storage import run_dir
+from velap.storage import OWN_RECORDS, run_dir
 from velap.tasks import TASKS, get_task, make_config, task_of
 
 if TYPE_CHECKING:
     from velap.evaluation.summary import Summary
     from velap.methods.base import Agent
     from velap.training.steps import Progress
-
-RECORDS = Path("results/records")
-"""Where evaluations keep their episode records."""
 
 Changes = Mapping[str, Mapping[str, Any]]
 """Config fields to replace: `{"train": {"joint_steps": 2000}}`."""
@@ -154,8 +151,10 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
 
 
 def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,
-             first_seed: int = 0, env: str | None = None, records: Path | str = RECORDS, fresh: bool = False,
-             device: str = "auto", head: Path | str | None = None) -> Summary:
+             first_seed: int = 0, env: str | None = None, env_kwargs: Mapping[str, Any] | None = None,
+             image_key: str | None = None, max_steps: int | None = None, success_reward: float | None = None,
+             records: Path | str = OWN_RECORDS, fresh: bool = False, batch: int = 10, device: str = "auto",
+             head: Path | str | None = None) -> Summary:
     """Success rate and more over seeded test episodes; goes on where an earlier call with the same records stopped.
 
     Args:
@@ -165,8 +164,13 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
         episodes: number of episodes.
         first_seed: seed of the first one; test seeds are 0 to 99.
         env: any Gymnasium id instead of the task's own environment.
+        env_kwargs: arguments of `gymnasium.make` besides the id.
+        image_key: key of the image in dict observations.
+        max_steps: time limit where the environment has none, or a shorter one [steps].
+        success_reward: least reward that means success, where `info` does not tell; None takes any positive one.
         records: root of the record files.
         fresh: move an existing record file aside first.
+        batch: environments at once.
         device: `auto`, `cpu` or `cuda`.
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
     """
@@ -174,6 +178,7 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
     from velap.evaluation.evaluate import evaluate as run
     from velap.evaluation.summary import summarise
 
-    what = Evaluation(task, method, Path(checkpoint) if checkpoint is not None else None, env=env, device=device,
-                      head=Path(head) if head is not None else None)
-    return summarise(run(what, range(first_seed, first_seed + episodes), Path(records), fresh=fresh))
+    what = Evaluation(task, method=method, checkpoint=None if checkpoint is None else Path(checkpoint), env=env,
+                      env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=max_steps,
+                      success_reward=success_reward, device=device, head=None if head is None else Path(head))
+    return summarise(run(what, range(first_seed, first_seed + episodes), Path(records), fresh=fresh, batch=batch))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+OWN_RECORDS, SHIPPED_RECORDS = Path("runs/records"), Path("results/records")
+"""Where a user's evaluations write, and where those of the published tables lie. The two never meet."""
 
 def run_dir(task: str, preset: str, seed: int) -> Path:
     """Where a training run lives unless said otherwise."""

@@ -17,6 +17,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from velap.cli.settings import parse_settings
 from velap.errors import ConfigError, VelapError
+from velap.storage import OWN_RECORDS, SHIPPED_RECORDS
 
 OUT = Console(highlight=False)
 ERR = Console(stderr=True, highlight=False)
@@ -125,8 +126,9 @@ def _show_head(checkpoint: Path, method: str) -> None:
 
 
 def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap", episodes: int = 100, first_seed: int = 0,
-             env: str | None = None, image_key: str | None = None, max_steps: int | None = None, preset: Preset = "default",
-             records: Records = Path("results/records"), fresh: bool = False, batch: int = 10, video: bool = False,
+             env: str | None = None, env_kwargs: tuple[str, ...] = (), image_key: str | None = None,
+             max_steps: int | None = None, success_reward: float | None = None, preset: Preset = "default",
+             records: Records = OWN_RECORDS, fresh: bool = False, batch: int = 10, video: bool = False,
              device: Device = "auto", settings: Settings = (), head: Path | None = None) -> None:
     """Run seeded test episodes and record each; repeat the command to go on where it stopped.
 
@@ -135,18 +137,24 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
         episodes: Number of episodes.
         first_seed: Seed of the first one; test seeds are 0 to 99.
         env: Any Gymnasium id, `module:Env-v0` included, instead of the task's own; TASK is then any label.
+        env_kwargs: Arguments of the environment, such as `obs_type=pixels`.
         image_key: Key of the image in dict observations.
-        max_steps: Time limit where the environment has none.
+        max_steps: Time limit where the environment has none, or a shorter one.
+        success_reward: Least reward that means success where the environment's info does not tell; any positive one unless
+            said.
         fresh: Move an existing record file aside first.
         batch: Environments at once.
         video: Film the first episode as well.
         head: What the method learnt; METHOD.safetensors beside the checkpoint unless said.
     """
+    from velap.cli.settings import parse_pairs
     from velap.evaluation.evaluate import Evaluation
     from velap.methods.base import SETTINGS
 
     changes = parse_settings(settings, {method: SETTINGS[method]} if method in SETTINGS else {})
-    what = Evaluation(task, method, checkpoint, preset, env, image_key, max_steps, device, changes, head)
+    what = Evaluation(task, method=method, checkpoint=checkpoint, preset=preset, env=env, env_kwargs=parse_pairs(env_kwargs),
+                      image_key=image_key, max_steps=max_steps, success_reward=success_reward, device=device,
+                      changes=changes, head=head)
     _evaluate(what, range(first_seed, first_seed + episodes), records, fresh, batch, video)
 
 
@@ -171,7 +179,7 @@ def _evaluate(what: Any, seeds: range, records: Path, fresh: bool, batch: int, v
 
 
 def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 100, out: Path | None = None,
-        records: Records = Path("results/records"), workers: int | None = None, device: Device = "auto",
+        records: Records = OWN_RECORDS, fresh: bool = False, workers: int | None = None, device: Device = "auto",
         settings: Settings = ()) -> None:
     """Collect (if the dataset is missing), train and evaluate in one go; repeat the command to go on where it stopped.
 
@@ -179,6 +187,7 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
         seed: Decides weights and batches.
         episodes: Test episodes, seeds from 0.
         out: Run directory; runs/TASK/PRESET/seedSEED unless said.
+        fresh: Move an existing record file aside first.
         workers: Processes that collect; one a core unless said.
     """
     from velap.data import minari_io
@@ -189,11 +198,11 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
         collect(task, workers=workers)
     checkpoint = _train(task, preset, seed, out, None, device, True, settings)
     OUT.print(f"checkpoint {checkpoint}", markup=False)
-    _evaluate(Evaluation(task, checkpoint=checkpoint, device=device), range(episodes), records, False, 10, False)
+    _evaluate(Evaluation(task, checkpoint=checkpoint, device=device), range(episodes), records, fresh, 10, False)
 
 
 def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make Table 1 of the paper.")] = None,
-          records: Records = Path("results/records"), write: Path | None = None, only: tuple[str, ...] = (), jobs: int = 2,
+          records: Path | None = None, write: Path | None = None, only: tuple[str, ...] = (), jobs: int = 2,
           dry_run: bool = False, no_run: bool = False, fresh: bool = False, episodes: int = 100, batch: int = 1) -> None:
     """Print the statistics of all records; with `1`, run whatever Table 1 still lacks and write it.
 
@@ -201,6 +210,8 @@ def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make
     at any time: the same command goes on from there.
 
     Args:
+        records: Root of the episode records; runs/records unless said, with `1` those of the published tables in
+            results/records.
         write: Document to update: README.md with its table marks; with `1` docs/results.md, or another one to write.
         only: Cells to run, such as `task=SpiralMaze method=bc,iql`. Axes are task, method, preset and seed; unless said all
             tasks, all methods, preset=default and seed=0.
@@ -215,8 +226,9 @@ def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make
         if only or dry_run or no_run or fresh or (jobs, episodes, batch) != (2, 100, 1):
             raise ConfigError("got options of `velap table 1` without the number; expected `velap table 1 ...`, or only "
                               "--records and --write.")
-        _table_of_records(records, write)
+        _table_of_records(records or OWN_RECORDS, write)
         return
+    records = records or SHIPPED_RECORDS
     table1 = _study("table_command")
     places = table1.Places(records.parent) if write is None else table1.Places(records.parent, write)
     options = _study("jobs").Options(records, episodes, batch)

@@ -34,6 +34,20 @@ def parse_settings(settings: Sequence[Sequence[str]], further: Mapping[str, obje
     return changes
 
 
+def parse_pairs(pairs: Sequence[str]) -> dict[str, Any]:
+    """`["obs_type=pixels", "size=96"]` -> `{"obs_type": "pixels", "size": 96}`; raises ConfigError on any other form."""
+    parsed: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not (equals and name.isidentifier()):
+            raise ConfigError(f"--env-kwargs got {pair!r}; expected NAME=VALUE, such as obs_type=pixels.")
+        try:
+            parsed[name] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            parsed[name] = text
+    return parsed
+
+
 def _as_type_of_default(defaults: object, part: str, field: str, value: Any) -> Any:
     """`value` in the type of the field's default; unknown fields pass, what takes the changes names them."""
     default = getattr(defaults, field, None)

@@ -65,8 +65,12 @@ def _listing(leaves: dict[tuple[str, ...], gym.Space]) -> str:
     return ", ".join(f"{'/'.join(path) or 'observation'}: {brief(space)}" for path, space in leaves.items())
 
 
-def find_image(space: gym.Space, image_key: str | None, dataset_id: str) -> ImageLayout:
-    """The image of an observation space: the one named (`a/b` for nested Dicts), or the only one there is."""
+def find_image(space: gym.Space, image_key: str | None, dataset_id: str,
+               advice: str = "render the frames into the dataset first") -> ImageLayout:
+    """The image of an observation space: the one named (`a/b` for nested Dicts), or the only one there is.
+
+    `advice` says what to do where there is none.
+    """
     leaves = dict(_leaves(space))
     if image_key is not None and () not in leaves:
         path = tuple(image_key.split("/"))
@@ -79,7 +83,7 @@ def find_image(space: gym.Space, image_key: str | None, dataset_id: str) -> Imag
         found = [layout for layout in found if leaves[layout.key].dtype == np.uint8] or found
     if not found:
         raise DatasetError(f"{dataset_id} has no image among its observations ({_listing(leaves)}); expected uint8 images "
-                           "[H, W, 3]. velap learns from pixels: render the frames into the dataset first.")
+                           f"[H, W, 3]. velap learns from pixels: {advice}.")
     if len(found) > 1:
         raise DatasetError(f"{dataset_id} has several images among its observations ({_listing(leaves)}); expected one. "
                            "Name the one to use with --image-key.")

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 import velap.envs  # noqa: F401 - registers the tasks
 from velap._version import __version__
@@ -34,6 +35,7 @@ class Evaluation:
 
     task: str
     """Task name; with `env`, any label."""
+    _: KW_ONLY
     method: str = "velap"
     checkpoint: Path | None = None
     """`model.safetensors` of a run; `random` needs none."""
@@ -41,10 +43,14 @@ class Evaluation:
     """Names the records of a method without a checkpoint; a checkpoint brings its own."""
     env: str | None = None
     """Any Gymnasium id, `module:Env-v0` included, instead of the task's own."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Arguments of `gymnasium.make` besides the id."""
     image_key: str | None = None
     """Key of the image in dict observations."""
     max_steps: int | None = None
-    """Time limit where the environment has none [steps]."""
+    """Time limit [steps], where it is shorter than the environment's own or the environment has none."""
+    success_reward: float | None = None
+    """Least reward that means success, for environments whose `info` does not tell; None takes any positive one."""
     device: str = "auto"
     changes: dict[str, dict[str, Any]] | None = None
     """Fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`, or of the method's own settings,
@@ -53,7 +59,7 @@ class Evaluation:
     """What the method learnt beside the checkpoint; None looks for `<method>.safetensors` in the checkpoint's folder."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Player:
     """A loaded method: the agent, the environments that it can act in, and what its records say."""
 
@@ -63,19 +69,22 @@ class Player:
     key: RunKey
     make_env: Callable[[], gym.Env[Any, Any]]
     image_size: int
-    image_key: str | None
-    max_steps: int | None
+    """Side of the images that the agent takes [px]."""
+
+    @property
+    def device(self) -> str:
+        """`cpu`, or the name of the GPU."""
+        if self.model is None:
+            return "cpu"
+        device = next(self.model.parameters()).device
+        return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
     def rollout(self, batch: int, observer: Observer | None = None) -> Rollout:
         """A rollout over `batch` new environments."""
         envs = make_envs(self.make_env, batch)
-        spec = envs[0].spec
-        limit = spec.max_episode_steps if spec is not None else None
-        if limit is None and self.max_steps is None:
-            raise ConfigError(f"the environment {self.key.env} has no time limit; give one with --max-steps.")
-        reader = FrameReader(envs[0], self.image_size, self.image_key)
-        return Rollout(envs, self.agent, reader, reset_options=reset_options(envs[0]), max_steps=self.max_steps,
-                       observer=observer)
+        reader = FrameReader(envs[0], self.image_size, self.key.image_key)
+        return Rollout(envs, self.agent, reader, reset_options=reset_options(envs[0]), max_steps=self.key.max_steps,
+                       success_reward=self.key.success_reward, observer=observer)
 
 
 def reset_options(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
@@ -84,7 +93,7 @@ def reset_options(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
 
 
 def load_player(what: Evaluation) -> Player:
-    """Load the checkpoint, make the agent and check that it fits the environment."""
+    """Load the checkpoint, make the agent, and check that model, camera and time limit fit the environment."""
     task_env = TASKS[what.task].env_id if what.task in TASKS else None
     env_id = what.env or get_task(what.task).env_id
     check_method(what.method)
@@ -93,17 +102,31 @@ def load_player(what: Evaluation) -> Player:
     if what.env is None and config.task != what.task:
         raise ConfigError(f"{what.checkpoint} was trained on {config.task!r}, not on {what.task!r}; expected "
                           f"the same. Name the task {config.task!r}, or an environment with --env.")
-    env = make_env(env_id)
+    size = model.spaces.height if model is not None else IMAGE_SIZE
+    env = make_env(env_id, what.env_kwargs)
     try:
         agent = make_agent(what.method, model, config, _checked_actions(env, model), loaded.head, loaded.settings)
+        FrameReader(env, size, what.image_key)
+        max_steps = _time_limit(env, what.max_steps)
     finally:
         env.close()
     key = RunKey(task=what.task if env_id == task_env else env_id, method=what.method, preset=config.preset,
-                 train_seed=loaded.seed, env=env_id,
+                 train_seed=loaded.seed, env=env_id, env_kwargs=what.env_kwargs, image_key=what.image_key,
+                 max_steps=max_steps, success_reward=what.success_reward,
                  config_hash=method_hash(config, what.method, loaded.head, loaded.settings), checkpoint=loaded.digest,
                  code_version=code_version())
-    size = model.spaces.height if model is not None else IMAGE_SIZE
-    return Player(agent, model, config, key, lambda: make_env(env_id), size, what.image_key, what.max_steps)
+    return Player(agent=agent, model=model, config=config, key=key, image_size=size,
+                  make_env=lambda: make_env(env_id, what.env_kwargs))
+
+
+def _time_limit(env: gym.Env[Any, Any], asked: int | None) -> int:
+    """The shorter one of the environment's time limit and the one asked for [steps]."""
+    own = env.spec.max_episode_steps if env.spec is not None else None
+    limits = [limit for limit in (own, asked) if limit is not None]
+    if not limits or min(limits) < 1:
+        raise ConfigError(f"got the time limits {own} (environment) and {asked} (asked for); expected at least one of them, "
+                          "of 1 step or more. Give one with --max-steps.")
+    return min(limits)
 
 
 class _Loaded(NamedTuple):
@@ -144,13 +167,24 @@ def _load_model(what: Evaluation) -> _Loaded:
     return _Loaded(model, override(config, **changes), seed, digest, head, settings)
 
 
-def make_env(env_id: str) -> gym.Env[Any, Any]:
-    """The Gymnasium environment of that id; raises UnknownTaskError when Gymnasium cannot make it."""
+def make_env(env_id: str, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, Any]:
+    """The Gymnasium environment of that id, in the render mode `rgb_array` where it has one.
+
+    Raises UnknownTaskError when Gymnasium cannot make it, ConfigError when it refuses its arguments.
+    """
+    kwargs = dict(kwargs or {})
     try:
-        return gym.make(env_id)
+        env = gym.make(env_id, **kwargs)
+        if env.render_mode is None and "rgb_array" in env.metadata.get("render_modes", ()) and "render_mode" not in kwargs:
+            env.close()
+            env = gym.make(env_id, render_mode="rgb_array", **kwargs)
+        return env
     except (gym.error.Error, ImportError) as error:
         raise UnknownTaskError(f"Gymnasium cannot make {env_id!r}: {error}. Expected a registered id, or `module:Env-v0` "
                                "with a module that registers it.") from error
+    except TypeError as error:
+        raise ConfigError(f"the environment {env_id!r} cannot be made with the arguments {kwargs}: {error}. Expected "
+                          "arguments that it takes; give them with --env-kwargs NAME=VALUE.") from error
 
 
 def _checked_actions(env: gym.Env[Any, Any], model: LatentModel | None) -> gym.spaces.Box:
@@ -183,6 +217,8 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
     """
     if len(seeds) == 0 or batch < 1:
         raise ConfigError(f"got {len(seeds)} episodes in batches of {batch}; expected at least one of each.")
+    if seeds[0] < 0:
+        raise ConfigError(f"got the first episode seed {seeds[0]}; expected 0 or more. Test seeds are 0 to 99.")
     player = player or load_player(what)
     with RecordFile(player.key.path(records), player.key, fresh) as file:
         for record in file.records:
@@ -190,17 +226,19 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
                 on_record(record)
         missing = [seed for seed in seeds if seed not in file.done]
         if missing:
-            for episode in player.rollout(min(batch, len(missing)), observer).run(missing):
-                record = to_record(player.key, episode)
+            batch = min(batch, len(missing))
+            for episode in player.rollout(batch, observer).run(missing):
+                record = to_record(player, episode, batch)
                 file.append(record)
                 on_record(record)
         return select(file.records, seeds)
 
 
-def to_record(key: RunKey, episode: Episode) -> Record:
-    """The record of an episode, times rounded to microseconds."""
-    return Record(**vars(key), episode_seed=episode.seed, success=episode.success, steps=episode.steps,
-                  truncated=episode.truncated, plan_ms=tuple(round(value, 3) for value in episode.plan_ms))
+def to_record(player: Player, episode: Episode, batch: int) -> Record:
+    """The record of an episode that ran with `batch` - 1 others, times rounded to microseconds."""
+    return Record(**vars(player.key), episode_seed=episode.seed, success=episode.success, steps=episode.steps,
+                  truncated=episode.truncated, plan_ms=tuple(round(value, 3) for value in episode.plan_ms), batch=batch,
+                  device=player.device)
 
 
 @cache

@@ -1,7 +1,7 @@
 """Episode records: one JSON line an episode, appended as it finishes, so that a killed evaluation loses at most one episode.
 
-A file holds one run only: same config, checkpoint and environment. A torn last line (the process was killed while writing)
-is dropped when the file is opened again; damage anywhere else is an error.
+A file holds one run: the same config, weights, environment, camera, time limit and meaning of success. A torn last line (the
+process was killed while writing) is dropped when the file is opened again; damage anywhere else is an error.
 """
 
 from __future__ import annotations
@@ -12,16 +12,22 @@ import fcntl
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import FileIO
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from velap.errors import RecordError
 from velap.runs import storage_errors
+from velap.tasks import TASKS
 
-IDENTITY = ("task", "method", "preset", "train_seed", "env", "config_hash", "checkpoint")
+SCHEMA = 2
+"""Version of a line. Schema 1 had no `schema` and none of `_NEW_IN_2`."""
+IDENTITY = ("task", "method", "preset", "train_seed", "env", "env_kwargs", "image_key", "max_steps", "success_reward",
+            "config_hash", "checkpoint")
 """Fields that every record of one file shares."""
+_NEW_IN_2: dict[str, Any] = {"env_kwargs": {}, "image_key": None, "success_reward": None, "batch": None, "device": None}
+"""Fields that schema 1 did not have, with what its records stand for: no options, and an unknown batch and device."""
 
 
 def record_path(root: Path, task: str, method: str, preset: str, train_seed: int) -> Path:
@@ -30,7 +36,7 @@ def record_path(root: Path, task: str, method: str, preset: str, train_seed: int
     return root / folder / f"{method}-{preset}" / f"train{train_seed}.jsonl"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunKey:
     """What decides the result of an episode besides its seed."""
 
@@ -43,16 +49,24 @@ class RunKey:
     """Gymnasium id."""
     config_hash: str
     checkpoint: str
-    """SHA-256 of the checkpoint file [hex]; empty for methods without one."""
+    """SHA-256 of the weights that the method acts by [hex]; empty for methods without any."""
     code_version: str
     """Package version and commit; may differ between the records of one file."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Arguments of `gymnasium.make` besides the id."""
+    image_key: str | None = None
+    """Key of the image in dict observations."""
+    max_steps: int | None = None
+    """Time limit [steps]; None only in records of schema 1 that do not tell it."""
+    success_reward: float | None = None
+    """Least reward that means success; None: any positive one."""
 
     def path(self, root: Path) -> Path:
         """Its record file below `root`."""
         return record_path(root, self.task, self.method, self.preset, self.train_seed)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Record(RunKey):
     """One episode."""
 
@@ -64,6 +78,11 @@ class Record(RunKey):
     """Ended by the time limit."""
     plan_ms: tuple[float, ...]
     """Every plan's time [ms]: its row's share of the batch that planned together."""
+    batch: int | None
+    """Environments that ran at once; None in records of schema 1."""
+    device: str | None
+    """What the networks ran on, `cpu` or the name of the GPU; None in records of schema 1."""
+    schema: int = SCHEMA
 
     @staticmethod
     def from_json(line: str) -> Record:
@@ -71,6 +90,10 @@ class Record(RunKey):
         raw = json.loads(line)
         if not isinstance(raw, dict):
             raise ValueError(f"a {type(raw).__name__} instead of an object")
+        if "schema" not in raw:
+            raw = _from_schema_1(raw)
+        if raw["schema"] > SCHEMA:
+            raise ValueError(f"schema {raw['schema']} of a newer velap; this one reads up to {SCHEMA}")
         expected = {field.name for field in dataclasses.fields(Record)}
         if set(raw) != expected:
             raise ValueError(f"missing keys {sorted(expected - set(raw))}, unknown keys {sorted(set(raw) - expected)}")
@@ -80,6 +103,17 @@ class Record(RunKey):
     def to_json(self) -> str:
         """One line without its end, keys in the order of the fields."""
         return json.dumps(dataclasses.asdict(self))
+
+
+def _from_schema_1(raw: dict[str, Any]) -> dict[str, Any]:
+    """A line of schema 1 with the fields of schema 2.
+
+    An episode that ran out of time tells the limit; for the others it is that of the task's environment, and unknown (None)
+    for an environment of someone else.
+    """
+    limits = {task.env_id: task.max_steps for task in TASKS.values()}
+    limit = raw.get("steps") if raw.get("truncated") else limits.get(raw.get("env", ""))
+    return {**raw, **_NEW_IN_2, "max_steps": limit, "schema": 1}
 
 
 def read_records(path: Path) -> list[Record]:

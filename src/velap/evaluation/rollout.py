@@ -20,6 +20,8 @@ from velap.data.images import find_image, to_rgb
 from velap.errors import ConfigError
 from velap.methods.base import Agent
 
+NO_PIXELS = "make the environment with the argument that gives pixels, such as --env-kwargs obs_type=pixels"
+
 
 @dataclass(frozen=True)
 class Episode:
@@ -48,7 +50,7 @@ class FrameReader:
 
     def __init__(self, env: gym.Env[Any, Any], side: int, image_key: str | None = None) -> None:
         self._name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
-        self._layout = find_image(env.observation_space, image_key, self._name)
+        self._layout = find_image(env.observation_space, image_key, self._name, NO_PIXELS)
         self._side = side
 
     def __call__(self, observation: Any) -> NDArray[np.uint8]:
@@ -62,11 +64,20 @@ class FrameReader:
         return to_rgb(image[None], self._layout, self._side)[0]
 
 
-def succeeded(reward: float, info: dict[str, Any]) -> bool:
-    """Success of a transition: the environment's own word where `info` has one, else a positive reward."""
+def succeeded(reward: float, info: dict[str, Any], least: float | None = None) -> bool:
+    """Success of a transition: what `info` says where it says it, else a reward of at least `least` (None: any positive).
+
+    Raises ConfigError for a negative reward without either: where every step costs, 0 may well be success.
+    """
     for key in ("success", "is_success"):
         if key in info:
             return bool(info[key])
+    if least is not None:
+        return reward >= least
+    if reward < 0:
+        raise ConfigError(f"the environment gave the reward {reward:g} and no `success` in its info; expected 0, or a "
+                          "positive reward for success. Say which reward means success, such as --success-reward 0 for an "
+                          "environment that gives -1 a step and 0 at the goal.")
     return reward > 0
 
 
@@ -96,12 +107,13 @@ class Rollout:
 
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], agent: Agent, read: FrameReader, *,
                  reset_options: dict[str, Any] | None = None, max_steps: int | None = None,
-                 observer: Observer | None = None) -> None:
+                 success_reward: float | None = None, observer: Observer | None = None) -> None:
         self._envs = list(envs)
         self._agent = agent
         self._read = read
         self._options = reset_options
         self._max_steps = max_steps
+        self._success_reward = success_reward
         self._observer = observer
 
     def run(self, seeds: Iterable[int]) -> Iterator[Episode]:
@@ -144,7 +156,7 @@ class Rollout:
             self._observer(index, row.seed, env, self._agent, None)
         observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
         row.frames.append(self._read(observation))
-        success = succeeded(float(reward), info)
+        success = succeeded(float(reward), info, self._success_reward)
         out_of_time = truncated or (self._max_steps is not None and row.steps >= self._max_steps)
         if not (success or terminated or out_of_time):
             return None

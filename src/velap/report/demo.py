@@ -89,6 +89,6 @@ def _play(console: Console, player: Player, episodes: int, video: Path, latent_m
             view.step(row)
 
         for episode in player.rollout(episodes, observe).run(range(episodes)):
-            records.append(to_record(player.key, episode))
+            records.append(to_record(player, episode, episodes))
             view(records[-1])
     return records

@@ -132,7 +132,7 @@ def latent_map_of(player: Player) -> LatentMap | None:
     try:
         if player.model is None or not can_probe(env):
             return None
-        reader = FrameReader(env, player.image_size, player.image_key)
+        reader = FrameReader(env, player.image_size, player.key.image_key)
         return probe(player.model, env, reader, player.config.model.frame_stack, np.random.default_rng(0))
     finally:
         env.close()

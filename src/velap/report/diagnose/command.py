@@ -143,7 +143,7 @@ def resolve(request: Request) -> _Subject:
     evaluation = None
     if env is not None or task in TASKS:
         changes = dict(request.changes or {})
-        evaluation = Evaluation(task, "velap", checkpoint, env=env, image_key=request.image_key,
+        evaluation = Evaluation(task, checkpoint=checkpoint, env=env, image_key=request.image_key,
                                 max_steps=request.max_steps, device=request.device, changes=changes)
     return _Subject(task, checkpoint, dataset_id, evaluation)
 
@@ -219,7 +219,7 @@ def _look_at_world(console: Console, request: Request, model: LatentModel, playe
     env: gym.Env[Any, Any] = player.make_env()
     seeds, frame_stack = range(request.first_seed, request.first_seed + STARTS), player.config.model.frame_stack
     try:
-        read = FrameReader(env, player.image_size, player.image_key)
+        read = FrameReader(env, player.image_size, player.key.image_key)
         with console.status("the expert's episodes"):
             curves = expert_curves(model, env, frame_stack, seeds[:SCENES])
         scenes, around = [], None
