@@ -48,8 +48,6 @@ SINGLE_FACTOR = 1.5
 """Joint training where the first transition of a window alone trains the values (`paper`), relative to whole windows."""
 LATENT_UPDATE_SECONDS = 0.05
 """One update of the latent phase [s]."""
-DYNAMICS_UPDATE_SECONDS = 0.017
-"""One update of h alone on frozen latents [s]."""
 VALUE_UPDATE_SECONDS = 0.029
 """One update of critics and policies alone on frozen latents [s]."""
 MEMBER_UPDATE_SECONDS = 0.011
@@ -130,7 +128,6 @@ def calibrated(job: Job) -> float:
         encoded = train.encoder_steps * 2 * train.encoder_pairs + train.joint_steps * windows
         frozen = (
             train.latent_steps * LATENT_UPDATE_SECONDS
-            + train.latent_dynamics_steps * DYNAMICS_UPDATE_SECONDS
             + train.latent_value_steps * VALUE_UPDATE_SECONDS
             + train.member_steps * train.members * MEMBER_UPDATE_SECONDS
             + train.distil_steps * DISTIL_UPDATE_SECONDS

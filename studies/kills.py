@@ -28,7 +28,7 @@ from velap.tasks import TASKS
 
 TASK = "SpiralMaze"
 SMALL = {
-    "train": {"joint_steps": 12, "latent_steps": 12, "batch_windows": 4, "latent_batch": 8, "log_every": 2,
+    "train": {"joint_steps": 12, "latent_steps": 12, "batch_windows": 4, "log_every": 2,
               "diagnose_every": 6, "checkpoint_every": 2, "holdout_episodes": 2},
     "planner": {"n_iter": 10, "candidates": 5}, "model": {"bank_size": 32},
 }

@@ -293,7 +293,7 @@ def small_spiral(monkeypatch: pytest.MonkeyPatch) -> None:
     """SpiralMaze with little data, little training and a planner that is quick."""
     task = TASKS["SpiralMaze"]
     small: dict[str, dict[str, Any]] = {
-        "train": {"joint_steps": 4, "latent_steps": 4, "batch_windows": 4, "latent_batch": 8, "log_every": 2,
+        "train": {"joint_steps": 4, "latent_steps": 4, "batch_windows": 4, "log_every": 2,
                   "diagnose_every": 4, "holdout_episodes": 2},
         "planner": {"n_iter": 10, "candidates": 5}, "model": {"bank_size": 32}}
     recipe = dataclasses.replace(task.recipe, trajectories=120)

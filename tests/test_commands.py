@@ -16,13 +16,13 @@ from velap.errors import ConfigError
 from velap.methods.base import METHODS, make_agent
 from velap.methods.states import StateEncoder
 from velap.models.heads import HEADS
-from velap.models.velap import LatentModel, Spaces
+from velap.models.velap import COMMAND_SCALE, LatentModel, Spaces
 from velap.training.latents import encode_all
 from velap.training.loop import Trainer
 from velap.training.pairs import Pairs
 
 MEMORY = 0.75
-REMEMBERING = dataclasses.replace(SMALL, command_memory=MEMORY, command_scale=3.0)
+REMEMBERING = dataclasses.replace(SMALL, command_memory=MEMORY)
 
 
 def make_model(settings: ModelConfig = REMEMBERING) -> LatentModel:
@@ -64,7 +64,7 @@ def test_actions_out_of_bounds_are_remembered_as_the_environment_gets_them():
     taken = states.act(torch.tensor([[5.0, -5.0, 0.5]]))
     np.testing.assert_allclose(taken, [[2.0, -2.0, 1.0]])
     seen = states(np.zeros((1, 2, 16, 16, 3), np.uint8))[0, -3:]
-    torch.testing.assert_close(seen, 3.0 * (1 - MEMORY) * torch.tensor([1.0, -1.0, 0.5]))
+    torch.testing.assert_close(seen, COMMAND_SCALE * (1 - MEMORY) * torch.tensor([1.0, -1.0, 0.5]))
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "random"])
@@ -113,7 +113,7 @@ def test_latents_without_memory_are_what_the_encoder_says():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"command_memory": 1.0}, {"command_memory": -0.1}, {"command_scale": 0.0}, {"command_dims": -1}]
+    "changes", [{"command_memory": 1.0}, {"command_memory": -0.1}, {"command_dims": -1}]
 )
 def test_a_memory_without_sense_is_refused(changes):
     with pytest.raises(ConfigError, match=next(iter(changes))):
@@ -130,7 +130,7 @@ def test_heads_afresh_learn_with_commands_and_the_encoder_without(tmp_path: Path
     before = {name: value.clone() for name, value in model.state_dict().items()}
     run.update()
     latents = encode_all(model, sampler)
-    torch.testing.assert_close(latents[:, -3:], 3.0 * sampler.commands(torch.arange(len(latents)), MEMORY))
+    torch.testing.assert_close(latents[:, -3:], COMMAND_SCALE * sampler.commands(torch.arange(len(latents)), MEMORY))
     for name, value in model.named_parameters():
         if name.startswith("encoder."):
             assert torch.equal(value, before[name]), name
@@ -151,13 +151,13 @@ def test_the_first_actions_alone_are_remembered():
     sampler = WindowSampler(make_store(), config().train, 2, torch.device("cpu"), np.zeros(0, np.int64))
     latents = encode_all(model, sampler)
     assert latents.shape[1] == REMEMBERING.latent_dim + 2 == model.config.width(3)
-    expected = 3.0 * sampler.commands(torch.arange(len(latents)), MEMORY)[:, :2]
+    expected = COMMAND_SCALE * sampler.commands(torch.arange(len(latents)), MEMORY)[:, :2]
     torch.testing.assert_close(latents[:, -2:], expected)
     states = StateEncoder(model)
     states.forget(np.ones(1, bool))
     states.act(torch.tensor([[1.0, -1.0, 0.5]]))
     seen = states(np.zeros((1, 2, 16, 16, 3), np.uint8))[0, REMEMBERING.latent_dim :]
-    torch.testing.assert_close(seen, 3.0 * (1 - MEMORY) * torch.tensor([1.0, -1.0]))
+    torch.testing.assert_close(seen, COMMAND_SCALE * (1 - MEMORY) * torch.tensor([1.0, -1.0]))
 
 
 def test_the_inverse_model_tells_how_far_a_lagging_hand_went():

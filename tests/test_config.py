@@ -31,11 +31,11 @@ def test_the_paper_preset_is_the_tables() -> None:
 def test_what_is_ours_is_off_in_the_paper_preset() -> None:
     config = make_config("SpiralMaze", "paper")
     model = config.model
-    assert (model.dynamics_residual, model.critic_bounded, model.bank_size, model.latent_norm) == (False, False, 0, False)
+    assert (model.dynamics_residual, model.critic_bounded, model.bank_size) == (False, False, 0)
     assert config.train.latent_steps == 0
     assert not config.train.whole_windows
-    assert (config.train.group_windows, config.train.anneal, config.train.reconstruction) == (1, False, 0)
-    assert (config.train.shift, config.controller.residuals) == (0, 0)
+    assert (config.train.group_windows, config.train.reconstruction) == (1, 0)
+    assert config.controller.residuals == 0
     assert not config.planner.coherent_noise
     assert config.planner.anchor == "none"
 
@@ -69,9 +69,9 @@ def test_records_older_than_a_field_keep_their_hash() -> None:
 
 
 @pytest.mark.parametrize(("part", "field", "value"), [
-    (TrainConfig, "group_windows", 0), (TrainConfig, "group_reach", 0), (TrainConfig, "group_goals", 1.5),
+    (TrainConfig, "group_windows", 0), (TrainConfig, "group_reach", 0),
     (ModelConfig, "frame_stack", 0), (ModelConfig, "norm", "group"), (ModelConfig, "encoder_filters", (32,)),
-    (ModelConfig, "n_ens", 0), (TrainConfig, "shift", 17),
+    (ModelConfig, "n_ens", 0),
     (TrainConfig, "discount", 1.0), (TrainConfig, "relabel_next", 0.5),
     (TrainConfig, "learning_rate", 0.0), (TrainConfig, "window", 2), (TrainConfig, "dynamics_loss", "l1"),
     (PlannerConfig, "n_iter", 0), (PlannerConfig, "p_sparse", 0.9), (PlannerConfig, "temperature_value", 0.0),

@@ -57,9 +57,9 @@ def test_mazes_tell_no_state():
 @pytest.mark.parametrize("task", ["WindowClose", "DrawerButton"])
 def test_the_study_learns_and_plays(tmp_path, task):
     quick = {"model": {"bank_size": 10, "success_policy": False, "held_policy": True}, "planner": {"n_iter": 20},
-             "train": {"latent_steps": 2, "latent_dynamics_steps": 2, "latent_value_steps": 2, "clone_steps": 0,
-                       "member_steps": 2, "members": 2, "held_steps": 2, "held_members": 2, "distil_steps": 2,
-                       "latent_horizon": 3, "latent_batch": 8},
+             "train": {"latent_steps": 2, "latent_value_steps": 2, "clone_steps": 0,
+                       "member_steps": 2, "members": 2, "held_steps": 2, "distil_steps": 2,
+                       "latent_horizon": 3},
              "controller": {"success_rollout": 0, "success_exponent": 0.0}}
     rows = study_exact_latents(Console(quiet=True), task, quick, quick=True, path=tmp_path / "x.json", contexts=3)
     assert [row["method"] for row in rows] == ["td3bc", "velap"] and {row["episodes"] for row in rows} == {10}

@@ -239,7 +239,7 @@ def test_the_joint_training_comes_first_where_it_is_missing(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("velap.data.frames.load_store", lambda *args, **kwargs: STORE)
     quick = ["train.joint_steps=2", "train.latent_steps=2", "train.batch_windows=2", "train.window=5",
-             "train.latent_batch=4", "train.precision=float32", "model.frame_stack=1", "head.steps=2", "train.log_every=1",
+             "train.precision=float32", "model.frame_stack=1", "head.steps=2", "train.log_every=1",
              "model.encoder_kernels=(4,)", "model.encoder_strides=(4,)", "model.encoder_filters=(4,)"]
     folder = tmp_path / "run"
     assert cli.main(["train", "--dataset", "test", "--out", str(folder), "--method", "iris", "--set", *quick]) == 0

@@ -18,10 +18,10 @@ from velap.methods.velap import VelapAgent
 from velap.models.velap import load_checkpoint, shared_weights
 from velap.training.held import hold
 from velap.training.loop import Trainer, train
+from velap.training.members import HELD_ACTIONS, HELD_MEMBERS
 
 OWN = dataclasses.replace(SMALL, held_policy=True, success_policy=True)
-QUICKLY = {"joint_steps": 1, "latent_steps": 1, "latent_value_batch": 16, "held_steps": 4, "held_actions": 3,
-           "held_members": 2, "distil_steps": 4, "clone_steps": 3, "clone_reach": 2}
+QUICKLY = {"joint_steps": 1, "latent_steps": 1, "held_steps": 4, "distil_steps": 4, "clone_steps": 3, "clone_reach": 2}
 
 
 def own(**changes) -> Config:
@@ -80,7 +80,7 @@ def test_the_end_of_successes_is_cloned(tmp_path):
 def test_each_phase_moves_the_policy_that_it_is_for(tmp_path):
     run = until(make(tmp_path, own(distil_steps=200)), "held")
     members = run.learner.held
-    assert members.count == 2 and members.name == "held"
+    assert members.count == HELD_MEMBERS and members.name == "held"
     for phase, moved in (("held", set()), ("held_distil", {"held_policy"}), ("clone", {"success_policy"})):
         before = {name: value.clone() for name, value in run.model.state_dict().items()}
         while run.step < run.total and run._phase_of(run.step)[0] == phase:
@@ -89,9 +89,9 @@ def test_each_phase_moves_the_policy_that_it_is_for(tmp_path):
         changed = {name.split(".")[0] for name, value in before.items() if not torch.equal(value, after[name])}
         assert changed == moved, phase
     cache = run.learner.cache
-    taught = members.act(cache.expand(2, -1, -1)).detach()
+    taught = members.act(cache.expand(HELD_MEMBERS, -1, -1)).detach()
     apart = float((taught[0] - taught[1]).abs().mean())
-    assert float((run.model.held_policy(cache).detach() - taught).abs().mean()) < apart, "between the two, or near one"
+    assert float((run.model.held_policy(cache).detach() - taught).abs().mean()) < apart, "between them, or near one"
 
 
 def test_policies_of_held_members_learn_at_every_update(tmp_path):
@@ -107,9 +107,9 @@ def test_held_members_learn_from_held_transitions(tmp_path):
     run = until(make(tmp_path, own()), "held")
     run.update()
     members, cache = run.learner.held, run.learner.cache
-    rows = members.draw(2, run.learner.generator)
+    rows = members.draw(HELD_MEMBERS, run.learner.generator)
     loss = members.value_loss(cache, rows)[0]
-    held = hold(run.sampler, 3, run.config.train.discount)
+    held = hold(run.sampler, HELD_ACTIONS, run.config.train.discount)
     then = cache[held.following[rows]]
     worth = members.qs(members.target, then, members.act(then)).amin(1) * run.config.train.discount
     goal = (held.rewards[rows] + held.alive[rows] * worth).detach()
@@ -124,10 +124,10 @@ def test_a_training_of_own_policies_resumes_to_the_same_bits(tmp_path, stop):
 
 def test_own_policies_are_learnt_anew_beside_a_finished_model(tmp_path):
     plain = config(dataclasses.replace(SMALL, half_weights=True), joint_steps=1, latent_steps=1, member_steps=2,
-                   latent_value_batch=16, distil_steps=4)
+                   distil_steps=4)
     first = train(plain, make_store(), tmp_path / "first", device="cpu")
     settings = override(plain, model={"held_policy": True, "success_policy": True},
-                        train={name: QUICKLY[name] for name in ("held_steps", "held_actions", "clone_steps", "clone_reach")})
+                        train={name: QUICKLY[name] for name in ("held_steps", "clone_steps", "clone_reach")})
     assert settings.shared_json() == plain.shared_json() and settings.hash() != plain.hash()
     seen = []
     second = train(settings, make_store(), tmp_path / "second", device="cpu", base=first.checkpoint, on_progress=seen.append)
@@ -200,6 +200,6 @@ def test_settings_without_their_policy_are_refused():
             override(config(), **{part: fields})
     with pytest.raises(ConfigError, match="stop_exponent"):
         override(config(OWN), controller={"success_exponent": 30.0})
-    for fields in ({"held_actions": 1}, {"held_steps": 4}, {"clone_reach": -1}):
-        with pytest.raises(ConfigError, match=r"held_actions|distil_steps|clone_reach"):
+    for fields in ({"held_steps": 4}, {"clone_reach": -1}):
+        with pytest.raises(ConfigError, match=r"distil_steps|clone_reach"):
             override(config(OWN), train=fields)

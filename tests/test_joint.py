@@ -16,7 +16,7 @@ from velap.models.velap import load_checkpoint
 from velap.runs import load_tensors
 from velap.training.joint import rollouts
 from velap.training.loop import MODEL, STATE, Trainer, train
-from velap.training.shifts import shifted
+from velap.training.pairs import Pairs
 
 SMALL = ModelConfig(
     frame_stack=2,
@@ -37,7 +37,6 @@ QUICK = TrainConfig(
     batch_windows=3,
     window=5,
     latent_steps=6,
-    latent_batch=8,
     latent_horizon=3,
     precision="float32",
     checkpoint_every=2,
@@ -196,17 +195,6 @@ def test_latent_phase_leaves_the_encoder_alone(tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(before, run.model.encoder.parameters(), strict=True))
 
 
-def test_the_joint_learning_rate_falls_only_when_asked(tmp_path):
-    for anneal, expected in ((False, [1.0] * 4), (True, [1.0, 0.855, 0.505, 0.155])):
-        run = trainer(tmp_path / str(anneal), joint_steps=4, anneal=anneal)
-        rates = []
-        for _ in expected:
-            run.update()
-            rates.append({group["lr"] for optimizer in run.learner.optimizers.values() for group in optimizer.param_groups})
-        assert [next(iter(rate)) / QUICK.learning_rate for rate in rates] == pytest.approx(expected, abs=1e-3)
-        assert all(len(rate) == 1 for rate in rates)
-
-
 def test_the_decoder_teaches_the_encoder_and_is_not_part_of_the_model(tmp_path):
     plain, taught = trainer(tmp_path / "plain"), trainer(tmp_path / "taught", reconstruction=1.0)
     for a, b in zip(plain.model.parameters(), taught.model.parameters(), strict=True):
@@ -245,8 +233,9 @@ def test_the_encoder_phase_moves_the_encoder_alone_and_the_others_follow(tmp_pat
         assert torch.equal(a, b), "the phase must not touch the model's first weights"
 
 
-def test_pairs_lie_in_one_training_episode_and_know_their_actions(tmp_path):
-    run = trainer(tmp_path, encoder_steps=1, encoder_pairs=500, encoder_reach=3)
+def test_pairs_lie_in_one_training_episode_and_know_their_actions(tmp_path, monkeypatch):
+    monkeypatch.setattr(Pairs, "REACH", 3)
+    run = trainer(tmp_path, encoder_steps=1, encoder_pairs=500)
     sampler, pairs = run.sampler, run.learner.pairs
     now, then = pairs.draw(run.generator)
     assert torch.equal(sampler.first[now], sampler.first[then])
@@ -286,16 +275,6 @@ def test_the_latent_phase_has_its_own_share_of_rewards(tmp_path):
     assert shares == [0.0]
 
 
-def test_a_share_of_the_pairs_begins_shortly_before_a_reward(tmp_path):
-    run = trainer(tmp_path, encoder_steps=1, encoder_pairs=500, encoder_reach=2, encoder_rewarded_share=1.0)
-    now, then = run.learner.pairs.draw(run.generator)
-    rewarded = run.sampler.rewarded
-    behind = (rewarded - now.unsqueeze(1)).clamp(min=-1)
-    assert ((behind >= 0) & (behind < 2)).any(1).all()
-    assert torch.equal(run.sampler.first[now], run.sampler.first[then])
-    assert set((then - now).tolist()) <= {1, 2}
-
-
 def test_pairs_teach_where_the_agent_went(tmp_path):
     """Frames that show a dot at the sum of all actions: the error of the summed actions falls."""
     store = make_store(episodes=40)
@@ -313,36 +292,6 @@ def test_pairs_teach_where_the_agent_went(tmp_path):
     assert np.mean(errors[-20:]) < 0.75 * np.mean(errors[:10])
 
 
-def test_frames_are_shifted_group_by_group():
-    stacks = torch.arange(3 * 4 * 5).view(3, 1, 4, 5, 1).to(torch.uint8).expand(3, 2, 4, 5, 3)
-    moved = shifted(stacks, 2, torch.tensor([[1, 0], [0, -2]]))
-    assert torch.equal(moved[:2, :, 1:], stacks[:2, :, :-1]) and torch.equal(moved[:2, :, 0], stacks[:2, :, 0])
-    assert torch.equal(moved[2, :, :, :3], stacks[2, :, :, 2:])
-    assert torch.equal(moved[2, :, :, 3:], stacks[2, :, :, 4:].expand(-1, -1, 2, -1)), "the border is repeated"
-
-
-@pytest.mark.parametrize("whole", [True, False])
-def test_a_group_of_windows_is_shifted_as_one(tmp_path, whole):
-    run = trainer(tmp_path, shift=2, group_windows=2, batch_windows=4, whole_windows=whole, window=3)
-    sampler = run.sampler
-    batch = sampler.sample(4, 3, whole, run.learner.generator)
-    stacks = sampler.stacks(batch.rows)
-    moved = run.learner._augmented(stacks, batch)
-    assert moved.shape == stacks.shape and moved.dtype == torch.uint8
-    window = torch.cat([torch.arange(16) // 4, torch.arange(len(stacks) - 16)])
-    for group in range(2):
-        rows = torch.isin(window, torch.tensor([2 * group, 2 * group + 1]))
-        fits = [
-            (dy, dx)
-            for dy in range(-2, 3)
-            for dx in range(-2, 3)
-            if torch.equal(moved[rows], shifted(stacks[rows], len(stacks), torch.tensor([[dy, dx]])))
-        ]
-        assert len(fits) == 1
-    run.update()
-    assert torch.equal(trainer(tmp_path / "plain").learner._augmented(stacks, batch), stacks)
-
-
 def test_policies_learn_in_every_second_update_whatever_the_phase(tmp_path):
     run = trainer(tmp_path, joint_steps=3, latent_steps=3, latent_value_steps=2, policy_every=2)
     learnt = []
@@ -357,7 +306,8 @@ def test_policies_learn_in_every_second_update_whatever_the_phase(tmp_path):
 CLONED = dataclasses.replace(SMALL, success_policy=True)
 
 
-def test_the_clone_phase_moves_the_policy_of_successes_alone_towards_their_actions(tmp_path):
+def test_the_clone_phase_moves_the_policy_of_successes_alone_towards_their_actions(tmp_path, monkeypatch):
+    monkeypatch.setattr(Pairs, "REACH", 3)
     run = Trainer(config(CLONED, clone_steps=400), make_store(), tmp_path, 0, torch.device("cpu"))
     while run.phase != "clone":
         run.update()
@@ -393,16 +343,8 @@ def test_runs_older_than_a_field_can_be_resumed(tmp_path):
     run.update()
     run.save()
     _, metadata = load_tensors(tmp_path / STATE)
-    assert not [name for name in ("anneal", "group_windows", "shift", "reconstruction") if name in metadata["config"]]
+    assert not [name for name in ("group_windows", "reconstruction") if name in metadata["config"]]
     trainer(tmp_path).resume()
-
-
-def test_an_annealed_run_cannot_be_resumed_with_another_length(tmp_path):
-    run = trainer(tmp_path, joint_steps=4, anneal=True)
-    run.update()
-    run.save()
-    with pytest.raises(CheckpointError, match="another config"):
-        trainer(tmp_path, joint_steps=8, anneal=True).resume()
 
 
 @pytest.mark.parametrize("norm", ["layer", "batch"])
@@ -491,7 +433,7 @@ def test_a_finished_run_can_be_given_more_phases(tmp_path):
     for (name, a), b in zip(whole.model.state_dict().items(), again.model.state_dict().values(), strict=True):
         assert torch.equal(a, b), name
     again.save()
-    for other in ({}, {"latent_value_steps": 2}, {"latent_dynamics_steps": 1, **more}, {"latent_steps": 7, **more}):
+    for other in ({}, {"latent_value_steps": 2}, {"latent_steps": 7, **more}):
         with pytest.raises(CheckpointError, match="schedule"):
             trainer(tmp_path / "first", **other).resume()
 

@@ -13,8 +13,9 @@ from velap.errors import ConfigError
 from velap.losses import cross_entropy_critic_loss
 from velap.models.networks import EnsembleMLP
 from velap.training.loop import Trainer
+from velap.training.members import BATCH
 
-MANY = {"member_steps": 4, "members": 3, "distil_steps": 4, "latent_value_batch": 16}
+MANY = {"member_steps": 4, "members": 3, "distil_steps": 4}
 
 
 def trained(path: Path, updates: int, **changes) -> Trainer:
@@ -65,7 +66,7 @@ def test_each_member_learns_from_its_own_critics(tmp_path):
     members.value_loss(cache, rows)[0].backward()
     assert touched(members.critics) and not touched(members.policies) and not touched(members.target)
     q = members.qs(members.critics, cache[rows], run.sampler.actions[rows])
-    assert q.shape == (3, run.model.config.n_global, 16) and float(q.detach().amin()) >= 0
+    assert q.shape == (3, run.model.config.n_global, BATCH) and float(q.detach().amin()) >= 0
     one = torch.zeros_like(q)
     for e in range(3):  # member e's critics are numbers e · n_global and after
         x = torch.cat([cache[rows[e]], run.sampler.actions[rows[e]]], -1)
@@ -88,7 +89,7 @@ def test_noise_blurs_what_members_see_and_a_floor_weighs_it(tmp_path):
     beyond = cache[rows + 1] + blur
     worth = members.qs(members.target, beyond, members.act(beyond)).amin(1) * run.config.train.discount
     goal = run.sampler.rewards[rows] + (~run.sampler.terminated[rows]).float() * worth
-    expected, _ = cross_entropy_critic_loss(q, goal.detach().unsqueeze(1), torch.ones(16), 0.01)
+    expected, _ = cross_entropy_critic_loss(q, goal.detach().unsqueeze(1), torch.ones(BATCH), 0.01)
     assert losses[1] == pytest.approx(expected.item())
 
 

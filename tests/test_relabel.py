@@ -114,10 +114,11 @@ def test_held_out_episodes_are_never_drawn():
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_groups_of_windows_come_from_episodes_near_each_other_and_share_goals(whole):
+def test_groups_of_windows_come_from_episodes_near_each_other_and_share_goals(whole, monkeypatch):
+    monkeypatch.setattr("velap.data.relabelling.GROUP_GOALS", 1.0)
     store = make_store(lengths=(5,) * 40, rewarded=())
     held = np.array([7, 20])
-    config = TrainConfig(group_windows=6, group_reach=2, group_goals=1.0, rewarded_share=0.0, **shares(other=1.0))
+    config = TrainConfig(group_windows=6, group_reach=2, rewarded_share=0.0, **shares(other=1.0))
     draw = WindowSampler(store, config, 1, torch.device("cpu"), held)
     batch = draw.sample(23, 4, whole, torch.Generator().manual_seed(0))  # three groups of six and one of five
     episodes = batch.rows[batch.start] // 6

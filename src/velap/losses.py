@@ -111,23 +111,6 @@ def rollout_mse_loss(predicted: Tensor, actual: Tensor, valid: Tensor, scale: Te
     return loss, {"loss": loss.detach()}
 
 
-def rollout_metric_loss(
-    predicted: Tensor, actual: Tensor, valid: Tensor, metric: Tensor, clip: float
-) -> tuple[Tensor, Tensor, Info]:
-    """Squared rollout error ‖(predicted - actual) · metric‖² over real steps (ours), linear in the error beyond `clip`
-    (Huber's loss: cut off there, an h that errs everywhere would learn nothing more).
-
-    predicted, actual [k, W, D]; valid bool [k, W]; metric [D, D]. Returns the mean over steps, the mean of each rollout's
-    steps [W] without gradient, and info.
-    """
-    squares = ((predicted - actual.detach()) @ metric).square().sum(-1)
-    squares = torch.where(squares > clip, 2 * (clip * squares.clamp(min=clip)).sqrt() - clip, squares)
-    counted = valid.float()
-    loss = (squares * counted).sum() / counted.sum().clamp(min=1)
-    rollout = (squares.detach() * counted).sum(0) / counted.sum(0).clamp(min=1)
-    return loss, rollout, {"loss": loss.detach()}
-
-
 def action_model_loss(
     decoded: Tensor, action: Tensor, mean: Tensor, log_variance: Tensor, kl_weight: float, weight: Tensor
 ) -> tuple[Tensor, Info]:

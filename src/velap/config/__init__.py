@@ -70,13 +70,9 @@ class ModelConfig:
     held_policy: bool = False
     """A policy learnt from actions held for several steps (`held_steps`), which leads VELAP in place of π^g. ours; off in
     `paper`."""
-    latent_norm: bool = False
-    """Latents are normalised to zero mean and unit variance over their dimensions. ours; off in `paper`."""
     command_memory: float = 0.0
     """Share that a leaky mean of the past actions keeps at a step; with more than 0 it stands behind the output of φ, as the
     speed of what follows commands slowly is hard to see in pixels. ours; 0 (off) in `paper`."""
-    command_scale: float = 2.0
-    """What that mean is multiplied by [latent distance]. ours."""
     command_dims: int = 0
     """So many actions are remembered, the first ones; 0 remembers all. ours: a gripper that no task needs is noise."""
     half_weights: bool = False
@@ -103,7 +99,6 @@ class ModelConfig:
         require(self.n_ens >= 1, "n_ens", self.n_ens, "at least one critic")
         require(self.n_global >= 1, "n_global", self.n_global, "at least one critic")
         require(0 <= self.command_memory < 1, "command_memory", self.command_memory, "at least 0 and less than 1")
-        require(self.command_scale > 0, "command_scale", self.command_scale, "a positive number")
         require(self.command_dims >= 0, "command_dims", self.command_dims, "0 or a number of actions")
         require(self.bank_size >= 0, "bank_size", self.bank_size, "0 or a number of latents")
 
@@ -158,7 +153,7 @@ class Config:
         """
         raw = dataclasses.asdict(self)
         for part in YOUNGER_FIELDS:
-            raw[part] = older_fields(part, raw[part])
+            raw[part] = older_fields(part, raw[part]) | CONSTANTS.get(part, {})
         return json.dumps(raw, sort_keys=True)
 
     def shared_json(self) -> str:
@@ -188,6 +183,8 @@ def _build(cls: type, raw: Any, where: str) -> Any:
     """A dataclass from parsed JSON, lists back to tuples, unknown keys refused."""
     if not isinstance(raw, dict):
         raise ConfigError(f"`{where}` is {type(raw).__name__}; expected an object with the fields of {cls.__name__}.")
+    constants = CONSTANTS.get(where.removeprefix("config."), {})
+    raw = {name: value for name, value in raw.items() if name not in constants or value != constants[name]}
     hints = get_type_hints(cls)
     unknown = sorted(set(raw) - set(hints))
     if unknown:
@@ -222,31 +219,29 @@ def override(config: Config, **changes: dict[str, Any]) -> Config:
     return dataclasses.replace(config, **parts)
 
 
+CONSTANTS: dict[str, dict[str, Any]] = {
+    "model": {"latent_norm": False},
+    "train": {"latent_batch": 256, "latent_heads": True},
+    "planner": {"max_neighbours": 16, "anchor_factor": 1.0},
+    "controller": {"lookahead_samples": 32},
+}
+"""Former fields by part, which are constants of the code now; saved configs still name them."""
 OWN_FIELDS = (
     ("model", "success_policy"), ("model", "held_policy"), ("model", "bank_size"), ("train", "clone_steps"),
-    ("train", "clone_candidates"), ("train", "clone_reach"), ("train", "held_steps"), ("train", "held_actions"),
-    ("train", "held_members"),
+    ("train", "clone_candidates"), ("train", "clone_reach"), ("train", "held_steps"),
 )
 """Fields by part that matter to VELAP alone, besides planner and controller."""
 YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
-    "model": ("success_policy", "held_policy", "command_memory", "command_scale", "command_dims", "moment_colours",
+    "model": ("success_policy", "held_policy", "command_memory", "command_dims", "moment_colours",
               "slow_features", "keep_moments", "half_weights"),
     "train": (
         "encoder_steps",
         "encoder_pairs",
-        "encoder_reach",
-        "encoder_rewarded_share",
         "encoder_learning_rate",
         "inverse",
         "heads_afresh",
         "latent_rewarded_share",
-        "latent_dynamics_steps",
-        "latent_dynamics_batch",
-        "latent_dynamics_horizon",
-        "latent_priority",
-        "latent_ridge",
         "latent_value_steps",
-        "latent_value_batch",
         "member_steps",
         "members",
         "member_noise",
@@ -255,20 +250,15 @@ YOUNGER_FIELDS: dict[str, tuple[str, ...]] = {
         "clone_candidates",
         "clone_reach",
         "held_steps",
-        "held_actions",
-        "held_members",
         "critic_loss",
         "critic_floor",
         "policy_relative",
         "group_windows",
         "group_reach",
-        "group_goals",
-        "anneal",
         "reconstruction",
         "reconstruction_side",
-        "shift",
     ),
-    "planner": ("rehearsals", "rehearsal_paths", "rehearsal_noise"),
+    "planner": (),
     "controller": ("residuals", "shortcut_exponent", "lookahead_gain", "goal_lookahead", "revisit_penalty",
                    "success_rollout", "success_exponent", "held_turn"),
 }

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from velap.config.training import require
 
-Anchor = Literal["none", "reject", "snap"]
+Anchor = Literal["none", "snap"]
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,6 @@ class PlannerConfig:
     """τ_goal = γ^this, Table 8."""
     neighbour_distance_factor: float = 3.0
     """d_neigh is this times the upper 5-percentile of one-step latent distances, Table 8."""
-    max_neighbours: int = 16
-    """M, nearest tree nodes that a candidate is compared with inside d_neigh. ours: the paper compares with all of them,
-    which
-    is the same as long as no more than M lie within d_neigh."""
     p_sparse: float = 0.4
     """p^sparse of the node sampling mixture. ours: the paper gives no number."""
     p_value: float = 0.4
@@ -53,25 +49,13 @@ class PlannerConfig:
     coherent_noise: bool = True
     """Draw the action noise once a simulation instead of once a step (the data are correlated walks). ours; off in
     `paper`."""
-    rehearsals: int = 0
-    """Walks of each of the best paths by π^l under h, with noise in the actions, that decide which one is followed; 0 trusts
-    Eq. 8. ours: a search finds leaks of h that the controller does not have."""
-    rehearsal_paths: int = 24
-    """Paths that are rehearsed with noise, the best of all by one walk without. ours."""
-    rehearsal_noise: float = 0.4
-    """Deviation of that noise [1, the largest action]. ours."""
     anchor: Anchor = "none"
-    """What to do with candidates by their nearest dataset latent: nothing, reject beyond `anchor_factor`, or also snap.
-    ours."""
-    anchor_factor: float = 1.0
-    """Largest distance to a dataset latent, in upper 5-percentiles of one-step distances. ours."""
+    """`snap` moves a candidate to its nearest dataset latent and rejects one farther from it than `ANCHOR_FACTOR`. ours."""
 
     def __post_init__(self) -> None:
-        require(self.rehearsals >= 0, "rehearsals", self.rehearsals, "0 or more walks")
-        require(self.rehearsal_noise >= 0, "rehearsal_noise", self.rehearsal_noise, "a deviation of 0 or more")
-        for name in ("n_iter", "n_sim", "candidates", "max_neighbours", "rehearsal_paths"):
+        for name in ("n_iter", "n_sim", "candidates"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        for name in ("temperature_sparse", "temperature_value", "neighbour_distance_factor", "anchor_factor"):
+        for name in ("temperature_sparse", "temperature_value", "neighbour_distance_factor"):
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
         require(self.expansion_weight >= 0, "expansion_weight", self.expansion_weight, "a weight of 0 or more")
         for name in ("p_sparse", "p_value", "p_policy"):
@@ -94,8 +78,6 @@ class ControllerConfig:
     lookahead: int = 3
     """π^l competes with sampled actions, each held for this many simulated steps and judged by Q_min to the waypoint; 0 acts
     by π^l alone [steps]. ours: π^l pushes into walls at corners that h knows of; 0 in `paper`."""
-    lookahead_samples: int = 32
-    """Actions drawn from g for the lookahead. ours."""
     shortcut_exponent: float = 0.0
     """On to the farthest waypoint with Q_min above γ^this, whatever lies between; 0 takes each in turn. ours: trees in open
     space zigzag, but a shortcut may cut corners."""
@@ -133,4 +115,4 @@ class ControllerConfig:
         require(self.goal_lookahead >= 0, "goal_lookahead", self.goal_lookahead, "0 or more steps")
         require(self.lookahead_gain >= 1, "lookahead_gain", self.lookahead_gain, "a factor of 1 or more")
         require(self.revisit_penalty >= 0, "revisit_penalty", self.revisit_penalty, "0 or more steps")
-        require(self.lookahead_samples >= 1, "lookahead_samples", self.lookahead_samples, "at least 1 action")
+

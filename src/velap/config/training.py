@@ -27,11 +27,6 @@ class TrainConfig:
     leave out where exactly a hand or a handle is."""
     encoder_pairs: int = 64
     """Pairs a batch of the encoder phase, drawn from all over the data. ours."""
-    encoder_reach: int = 20
-    """Most steps between the two states of a pair [steps]. ours."""
-    encoder_rewarded_share: float = 0.0
-    """Share of pairs that begin at most `encoder_reach` steps before a reward, beyond chance. ours, for objects that hardly
-    ever move otherwise; it did not help on FaucetClose (`docs/decisions.md`)."""
     encoder_learning_rate: float = 1e-3
     """Peak learning rate of the encoder phase, cosine to a hundredth. ours."""
     inverse: float = 0.3
@@ -52,15 +47,10 @@ class TrainConfig:
     """Rollouts of h a batch of whole windows, their starts drawn at random; 0 starts one wherever k steps are left. ours."""
     learning_rate: float = 3e-4
     """Table 7, Adam."""
-    anneal: bool = False
-    """The joint phase's learning rate falls along a cosine to a hundredth of `learning_rate`. ours; off in `paper`."""
     c0: float = 0.2
     """Weight of the global critic's loss, Eq. 2, Table 7."""
     c1: float = 0.01
     """Weight of the dynamics loss, Eq. 2, Table 7 (0.001 in SpiralMaze)."""
-    shift: int = 0
-    """Largest random shift of the joint phase's frames, the same for all frames of a group of windows [px]; 0 has none.
-    ours: a hundred scenes are few for an encoder."""
     reconstruction: float = 0.0
     """Weight of the reconstruction loss of the joint phase; 0 has none. ours: Eq. 2 asks the latent only for what a step or
     a value depends on here and now, and far parts of a scene may go missing; the paper does without."""
@@ -101,8 +91,6 @@ class TrainConfig:
     ours: goals of other trajectories (strategy c) then teach what is near within a scene, not only to tell scenes apart."""
     group_reach: int = 8
     """Largest distance of the episodes of a group in the recording from its first [episodes]. ours."""
-    group_goals: float = 0.5
-    """Share of the goals of strategy (c) that come from the same group. ours."""
     rewarded_share: float = 0.05
     """Share of windows drawn to hold a rewarded transition, beyond chance. ours; 0 in `paper`."""
     target_rate: float = 0.05
@@ -116,29 +104,14 @@ class TrainConfig:
     and an encoder that learns beside them sees less."""
     latent_steps: int = 4_000
     """Updates of the latent phase: encoder frozen, all latents cached. ours; 0 in `paper`."""
-    latent_batch: int = 256
-    """Windows a batch of the latent phase. ours."""
     latent_horizon: int = 5
     """Rollout length of the dynamics in the latent phase [steps]. ours."""
     latent_rewarded_share: float | None = None
     """`rewarded_share` of the latent phase; None takes that one. ours: an encoder has to see rewards to tell them apart, but
     a share beyond chance makes states that look like rewarded ones too valuable."""
-    latent_dynamics_steps: int = 0
-    """Updates of h alone after the latent phase, on short rollouts from all over the data; 0 has none [steps]. ours: long
-    rollouts are few transitions an update, and h needs many."""
-    latent_dynamics_batch: int = 512
-    """Rollouts a batch of those. ours."""
-    latent_dynamics_horizon: int = 3
-    """Their length [steps]. ours."""
-    latent_priority: float = 0.5
-    """Half of them are drawn by the last error there to this power; 0 draws all uniformly. ours: contacts are rare."""
-    latent_ridge: float = 0.1
-    """Share of the mean variance that is added to every direction's before one-step changes are made white. ours."""
     latent_value_steps: int = 0
-    """Updates of critics, policies and g alone after those of h, on cached latents; 0 has none [steps]. ours: values a
+    """Updates of critics, policies and g alone after the latent phase, on cached latents; 0 has none [steps]. ours: values a
     hundred steps from the goal take thousands of updates, and h's rollouts would cost most of them."""
-    latent_value_batch: int = 512
-    """Transitions a batch of those. ours."""
     member_steps: int = 0
     """Updates of `members` π^g with critics of their own after the values, on cached latents; 0 has none [steps]. ours:
     where the data are thin, what one policy does is luck; the median of several is less so."""
@@ -150,15 +123,9 @@ class TrainConfig:
     distil_steps: int = 0
     """Updates that teach the members' median action and mean value to the model's π^g and Q^g [steps]. ours."""
     held_steps: int = 0
-    """Updates of members whose transitions are of `held_actions` steps, for the policy of `held_policy`, which then learns
+    """Updates of members whose transitions are of `HELD_ACTIONS` steps, for the policy of `held_policy`, which then learns
     their median for `distil_steps`; 0 has none [steps]. ours: which way to go a hundred steps from the goal is easier to
     tell by several steps than by one."""
-    held_actions: int = 5
-    """Steps of those transitions; their action is the mean of as many [steps]. ours."""
-    held_members: int = 3
-    """Those members. ours."""
-    latent_heads: bool = True
-    """The latent phase goes on training critics, policies and g on the frozen latents; off, it trains h alone. ours."""
     clone_steps: int = 0
     """Updates of the last phase, on cached latents too: the policy of `success_policy` is cloned from the transitions of
     successful episodes; 0 has none [steps]. ours."""
@@ -183,26 +150,20 @@ class TrainConfig:
     """Model updates between checkpoints [steps]. ours."""
 
     def __post_init__(self) -> None:
-        later = ("latent_steps", "latent_dynamics_steps", "latent_value_steps", "member_steps", "distil_steps",
-                 "held_steps", "clone_steps", "clone_reach")
+        later = ("latent_steps", "latent_value_steps", "member_steps", "distil_steps", "held_steps", "clone_steps",
+                 "clone_reach")
         for name in ("encoder_steps", "joint_steps", *later, "value_transitions", "dynamics_rollouts"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in (
             "encoder_pairs",
-            "encoder_reach",
             "batch_windows",
             "window",
             "dynamics_horizon",
             "policy_every",
             "group_windows",
             "group_reach",
-            "latent_batch",
             "latent_horizon",
-            "latent_dynamics_batch",
-            "latent_dynamics_horizon",
-            "latent_value_batch",
             "members",
-            "held_members",
             "clone_candidates",
             "log_every",
             "diagnose_every",
@@ -211,18 +172,15 @@ class TrainConfig:
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("encoder_learning_rate", "learning_rate", "latent_learning_rate", "temperature"):
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        for name in ("inverse", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight", "latent_priority", "latent_ridge"):
+        for name in ("inverse", "c0", "c1", "reconstruction", "c2", "c3", "kl_weight"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "a weight of 0 or more")
         require(1 <= self.reconstruction_side <= 64, "reconstruction_side", self.reconstruction_side, "1 to 64 px")
-        require(0 <= self.shift <= 16, "shift", self.shift, "0 to 16 px")
         require(self.member_noise >= 0, "member_noise", self.member_noise, "0 or a positive number of deviations")
         taught = self.member_steps > 0 or self.held_steps > 0
         require((self.distil_steps > 0) == taught, "distil_steps", self.distil_steps,
                 "at least 1 where `member_steps` or `held_steps` is set, and 0 where neither is")
-        require(self.held_actions >= 2, "held_actions", self.held_actions, "at least 2 steps")
         require(0 < self.discount < 1, "discount", self.discount, "a number between 0 and 1")
-        require(0 <= self.group_goals <= 1, "group_goals", self.group_goals, "a share from 0 to 1")
-        for name in ("rewarded_share", "latent_rewarded_share", "encoder_rewarded_share"):
+        for name in ("rewarded_share", "latent_rewarded_share"):
             share = getattr(self, name)
             require(share is None or 0 <= share <= 1, name, share, "a share from 0 to 1")
         require(0 < self.target_rate <= 1, "target_rate", self.target_rate, "a rate in (0, 1]")
@@ -268,7 +226,6 @@ class TrainConfig:
             ("encoder", self.encoder_steps),
             ("joint", self.joint_steps),
             ("latent", self.latent_steps),
-            ("dynamics", self.latent_dynamics_steps),
             ("values", self.latent_value_steps),
             ("members", self.member_steps),
             ("distil", self.distil_steps if self.member_steps else 0),

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from velap.config.training import TrainConfig
 
+GROUP_GOALS = 0.5
+"""Share of the goals of strategy (c) that come from the same group of windows. ours."""
+
 
 class Relabelled(NamedTuple):
     """Goals, rewards and continuation of D' for T transitions."""
@@ -28,7 +31,7 @@ def relabel(
 
     (a) the next state, reward 1, end of episode; (b) a later state of the same trajectory; (c) a state of another one.
     (b) starts two steps ahead: one step ahead it is (a), and labelling it 0 would contradict (a). Whenever the drawn goal
-    is the very next frame, the transition counts as (a). Of the goals (c), the share `group_goals` comes from windows of the
+    is the very next frame, the transition counts as (a). Of the goals (c), the share `GROUP_GOALS` comes from windows of the
     same group (ours).
     rows int64 [M]; start int64 [T] positions of z_t; inside bool [T]; valid bool [B, L].
     """
@@ -57,7 +60,7 @@ def relabel(
         base = window // config.group_windows * config.group_windows
         members = (windows - base).clamp(max=config.group_windows)
         beside = base + (window - base + 1 + uniform(members - 1)) % members
-        near = torch.rand(n, generator=generator, device=device) < config.group_goals
+        near = torch.rand(n, generator=generator, device=device) < GROUP_GOALS
         elsewhere = torch.where(near & (members > 1), beside, elsewhere)
     other = elsewhere * width + uniform(steps_inside[elsewhere] + 1)
 

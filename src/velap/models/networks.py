@@ -108,7 +108,6 @@ class Encoder(nn.Module):
             channels = filters
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.dense = MLP(channels * height * width, config.encoder_dense, config.latent_dim, config.norm)
-        self.final_norm = nn.LayerNorm(config.latent_dim, elementwise_affine=False) if config.latent_norm else nn.Identity()
         self.dtype = getattr(torch, precision)
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -117,7 +116,7 @@ class Encoder(nn.Module):
         x = x.to(self.dtype).mul_(2 / 255).sub_(1).permute(0, 3, 1, 2)
         with torch.autocast(frames.device.type, dtype=self.dtype, enabled=self.dtype != torch.float32):
             x = self.convolutions(x).flatten(1)
-        return self.final_norm(self.dense(x.float())).reshape(*prefix, -1)
+        return self.dense(x.float()).reshape(*prefix, -1)
 
 
 class Policy(MLP):

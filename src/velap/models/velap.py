@@ -29,6 +29,9 @@ UNREWARDED = -4.0
 """Initial logit of bounded critics: sparse returns start near 0; from a half they would take thousands of updates to
 decay."""
 
+COMMAND_SCALE = 2.0
+"""What the mean of past commands in a latent is multiplied by [latent distance]. ours."""
+
 
 @dataclass(frozen=True)
 class Spaces:
@@ -65,7 +68,7 @@ class LatentModel(nn.Module):
             for critic in (self.local_critics, self.global_critic):
                 nn.init.constant_(critic.biases[-1], UNREWARDED)
         if config.command_memory > 0:
-            self.register_buffer("command_weight", torch.tensor(config.command_scale))
+            self.register_buffer("command_weight", torch.tensor(COMMAND_SCALE))
         self.register_buffer("action_low", torch.tensor(spaces.action_low))
         self.register_buffer("action_high", torch.tensor(spaces.action_high))
         self.register_buffer("step_distance", torch.tensor(0.0))
@@ -73,7 +76,7 @@ class LatentModel(nn.Module):
         self.register_buffer("bank_latents", torch.zeros(config.bank_size, latent, dtype=torch.float16))
         self.register_buffer("bank_rows", torch.full((config.bank_size,), -1, dtype=torch.int32))
         self.command_weight: Tensor
-        """float32 [], what the commands are multiplied by: `command_scale`, or 0 while a training is to do without them."""
+        """float32 [], what the commands are multiplied by: `COMMAND_SCALE`, or 0 while a training is to do without them."""
         self.action_low: Tensor
         self.action_high: Tensor
         self.step_distance: Tensor

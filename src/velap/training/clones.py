@@ -23,6 +23,8 @@ from velap.threads import TRANSITIONS_A_THREAD, one_thread
 from velap.training.capture import adam
 from velap.training.latents import evaluated
 
+BATCH = 256
+"""Transitions a batch. ours."""
 STATES = 3_000
 """States of the data that are looked at; simulations start from the half of them that is farther from the goal by Q^g."""
 HORIZON = 150
@@ -110,7 +112,7 @@ class Cloning:
 
     def update(self, cache: Tensor, generator: torch.Generator) -> Info:
         """One update. cache [F, D]."""
-        drawn = torch.randint(len(self.rows), (self.config.latent_batch,), generator=generator, device=self.rows.device)
+        drawn = torch.randint(len(self.rows), (BATCH,), generator=generator, device=self.rows.device)
         rows = self.rows[drawn]
         self.optimizer.zero_grad(set_to_none=True)
         with one_thread(rows.device, len(rows) <= TRANSITIONS_A_THREAD):

@@ -35,12 +35,15 @@ from velap.threads import TRANSITIONS_A_THREAD, one_thread
 from velap.training.capture import Captured, adam, set_rate
 from velap.training.clones import Cloning
 from velap.training.latents import commands_before, encode_all, evaluated
-from velap.training.members import Members
+from velap.training.members import HELD_ACTIONS, Members
 from velap.training.pairs import FrameDecoder, PairObjective
-from velap.training.shifts import shifted
 from velap.training.slow import MomentObjective
 from velap.training.steps import cosine
-from velap.training.transitions import TransitionObjective
+
+LATENT_BATCH = 256
+"""Windows a batch of the latent phase. ours."""
+VALUE_BATCH = 512
+"""Transitions a batch of the value phase. ours."""
 
 
 def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -61,7 +64,7 @@ def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple
 
 class JointLearner:
     """Owns the model, its target critics and the optimisers; `encoder_step`, `joint_step`, `latent_step`,
-    `dynamics_step`, `value_step`, `member_step`, `distil_step` and `clone_step` are single updates."""
+    `value_step`, `member_step`, `distil_step` and `clone_step` are single updates."""
 
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         self.model, self.config, self.sampler, self.generator = model, config, sampler, generator
@@ -72,7 +75,6 @@ class JointLearner:
         self.decoder = None
         if config.reconstruction > 0:
             self.decoder = FrameDecoder(model, config.reconstruction_side, sampler, generator)
-        self.transitions: TransitionObjective | None = None
         self.pairs: PairObjective | MomentObjective | None = None
         if config.encoder_steps > 0:
             objective = MomentObjective if isinstance(model.encoder, MomentEncoder) else PairObjective
@@ -82,7 +84,7 @@ class JointLearner:
             self.members = Members(model, config, sampler, generator)
         self.held: Members | None = None
         if config.held_steps > 0:
-            self.held = Members(model, config, sampler, generator, hold=config.held_actions)
+            self.held = Members(model, config, sampler, generator, hold=HELD_ACTIONS)
         self.cloning: Cloning | None = None
         if config.clone_steps > 0:
             assert model.success_policy is not None, "clone_steps asks for success_policy"
@@ -110,7 +112,7 @@ class JointLearner:
     def companions(self) -> dict[str, nn.Module]:
         """Target critics by name, and what is thrown away in the end."""
         clones = None if self.cloning is None else self.cloning.candidates
-        extra = {"decoder": self.decoder, "pairs": self.pairs, "transitions": self.transitions, "clones": clones,
+        extra = {"decoder": self.decoder, "pairs": self.pairs, "clones": clones,
                  "members": self.members, "held": self.held}
         kept = {name: module for name, module in extra.items() if module is not None}
         return {"local": self.local_target, "global": self.global_target, **kept}
@@ -152,13 +154,13 @@ class JointLearner:
 
     def joint_step(self) -> Info:
         """One update of Eq. 2, then one of Eq. 5 and of g."""
-        return self._run_in_turn("joint", self._update_jointly, capture=self.config.shift == 0)
+        return self._run_in_turn("joint", self._update_jointly)
 
     def _update_jointly(self, policies: bool) -> Info:
         config = self.config
         batch = self.sampler.sample(config.batch_windows, config.window, config.whole_windows, self.generator)
         self.model_optimizer.zero_grad(set_to_none=True)
-        stacks = self._augmented(self.sampler.stacks(batch.rows), batch)
+        stacks = self.sampler.stacks(batch.rows)
         encoded = self.model.encoder(stacks)
         seen = encoded.detach().requires_grad_()  # the heads' gradient is gathered here and goes to the encoder in one piece
         latents = self.model.with_commands(seen, commands_before(self.model, self.sampler, batch.rows))
@@ -180,52 +182,23 @@ class JointLearner:
         with self._threads(batch):
             return {"dynamics/loss": info["loss"], **more, **self._step(latents.detach(), batch, policies)}
 
-    def _augmented(self, stacks: Tensor, batch: Batch) -> Tensor:
-        """Stacks [M, N, H, W, 3] shifted at random, each group of windows as one: what it shares stays shared."""
-        most = self.config.shift
-        if most == 0:
-            return stacks
-        windows, length = batch.valid.shape
-        group = self.config.group_windows * (length + 1)
-        count = -(-windows // self.config.group_windows)
-        offsets = torch.randint(-most, most + 1, (count, 2), generator=self.generator, device=stacks.device)
-        whole = windows * (length + 1)
-        parts = [shifted(stacks[:whole], group, offsets)]
-        if len(stacks) > whole:  # one goal a window
-            parts.append(shifted(stacks[whole:], self.config.group_windows, offsets))
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
-
     def latent_step(self) -> Info:
-        """One update on cached latents: the dynamics by rollout error, the other heads as before (when `latent_heads`)."""
+        """One update on cached latents: the dynamics by rollout error, the other heads as before."""
         return self._run_in_turn("latent", self._update_on_latents)
 
     def _update_on_latents(self, policies: bool) -> Info:
         assert self.cache is not None, "begin_latent_phase comes first"
         config = self.config
         share = config.latent_rewarded_share
-        batch = self.sampler.sample(config.latent_batch, config.latent_horizon, False, self.generator, rewarded_share=share)
+        batch = self.sampler.sample(LATENT_BATCH, config.latent_horizon, False, self.generator, rewarded_share=share)
         latents = self.cache[batch.rows]
         self.model_optimizer.zero_grad(set_to_none=True)
         with self._threads(batch):
             predicted, truth, valid = rollouts(self.model, latents, batch, config.latent_horizon)
             dynamics, info = rollout_mse_loss(predicted, latents[truth], valid, self.step_square)
-            if not config.latent_heads:
-                dynamics.backward()
-                self.model_optimizer.step()
-                return {"dynamics/loss": info["loss"]}
             values, more = self.value_loss(latents, batch)
             (dynamics + values).backward()
             return {"dynamics/loss": info["loss"], **more, **self._step(latents, batch, policies)}
-
-    def dynamics_step(self) -> Info:
-        """One update of h alone, on cached latents (ours)."""
-        assert self.transitions is not None, "latent_dynamics_steps is 0, or begin_latent_phase is still to come"
-        self.model_optimizer.zero_grad(set_to_none=True)
-        with one_thread(self.transitions.metric.device, self.config.latent_dynamics_batch <= TRANSITIONS_A_THREAD):
-            loss, info = self.transitions.loss(self.model, self.generator)
-            loss.backward()
-            self.model_optimizer.step()
-        return {"dynamics/loss": info["loss"]}
 
     def value_step(self) -> Info:
         """One update of critics, policies and g alone, on cached latents (ours)."""
@@ -234,7 +207,7 @@ class JointLearner:
     def _update_values(self, policies: bool) -> Info:
         assert self.cache is not None, "begin_latent_phase comes first"
         config = self.config
-        batch = self.sampler.sample(config.latent_value_batch, config.dynamics_horizon, False, self.generator,
+        batch = self.sampler.sample(VALUE_BATCH, config.dynamics_horizon, False, self.generator,
                                     rewarded_share=config.latent_rewarded_share)
         latents = self.cache[batch.rows]
         self.model_optimizer.zero_grad(set_to_none=True)
@@ -273,21 +246,21 @@ class JointLearner:
             return self.clone_step(done, steps)
         self.set_learning_rate(self.config.latent_learning_rate * cosine(done / steps))
         steps_of: dict[str, Callable[[], Info]] = {
-            "latent": self.latent_step, "dynamics": self.dynamics_step, "values": self.value_step,
+            "latent": self.latent_step, "values": self.value_step,
             "members": self.member_step, "distil": self.distil_step,
             "held": partial(self.member_step, held=True), "held_distil": partial(self.distil_step, held=True),
         }
         return steps_of[phase]()
 
-    def _run_in_turn(self, name: str, update: Callable[[bool], Info], capture: bool = True) -> Info:
+    def _run_in_turn(self, name: str, update: Callable[[bool], Info]) -> Info:
         """`update(policies)`, where the policies learn in every `policy_every`-th update."""
         self.updates += 1
         policies = self.updates % self.config.policy_every == 0
-        return self._run(f"{name}/{policies}", partial(update, policies), capture)
+        return self._run(f"{name}/{policies}", partial(update, policies))
 
-    def _run(self, name: str, update: Callable[[], Info], capture: bool = True) -> Info:
+    def _run(self, name: str, update: Callable[[], Info]) -> Info:
         """`update()`; with `graphs` as one that is captured once for each name."""
-        if not (self.graphs and capture):
+        if not self.graphs:
             return update()
         if name not in self._captured:
             self._captured[name] = Captured(update, self.generator)
@@ -311,8 +284,6 @@ class JointLearner:
         rows = self.sampler.transitions
         self.step_square = (self.cache[rows + 1] - self.cache[rows]).square().sum(-1).mean()
         self._optimise(self.config.latent_learning_rate, encoder=False)
-        if self.config.latent_dynamics_steps > 0:
-            self.transitions = TransitionObjective(self.config, self.sampler, self.cache)
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """For the schedule of a phase."""

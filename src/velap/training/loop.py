@@ -131,7 +131,7 @@ class Trainer:
             learner.set_learning_rate(train.encoder_learning_rate * falling)
             info = learner.encoder_step()
         elif phase == "joint":
-            learner.set_learning_rate(train.learning_rate * (falling if train.anneal else 1.0))
+            learner.set_learning_rate(train.learning_rate)
             info = learner.joint_step()
         else:
             self._freeze()
@@ -209,13 +209,12 @@ class Trainer:
     def _identity(self) -> dict[str, str]:
         """What must agree for a resume: everything that has had an effect on training so far.
 
-        Planner and controller never have. How long the joint phase lasts (where its learning rate does not depend on it) and
-        what later phases do count once they have begun (`schedule`).
+        Planner and controller never have. How long the joint phase lasts and what later phases do count once they have
+        begun (`schedule`).
         """
         train = older_fields("train", asdict(self.config.train))
-        late = () if self.config.train.anneal else ("joint_steps",)
         later = ("latent_", "held_", "clone_")
-        schedule = {name: train.pop(name) for name in sorted(train) if name in late or name.startswith(later)}
+        schedule = {name: train.pop(name) for name in sorted(train) if name == "joint_steps" or name.startswith(later)}
         learned = {"task": self.config.task, "model": older_fields("model", asdict(self.config.model)), "train": train}
         return {
             "config": json.dumps(learned, sort_keys=True),
@@ -246,8 +245,7 @@ class Trainer:
 
 def phase_of_field(name: str) -> str:
     """The phase that a field of the schedule belongs to; what several share belongs to the first of them."""
-    parts = {"joint": ("joint_",), "dynamics": ("latent_dynamics_", "latent_priority", "latent_ridge"),
-             "values": ("latent_value_",), "held": ("held_",), "clone": ("clone_",)}
+    parts = {"joint": ("joint_",), "values": ("latent_value_",), "held": ("held_",), "clone": ("clone_",)}
     return next((phase for phase, prefixes in parts.items() if name.startswith(prefixes)), "latent")
 
 

@@ -29,6 +29,12 @@ from velap.models.velap import UNREWARDED, LatentModel
 from velap.training.capture import adam
 from velap.training.held import hold as held_transitions
 
+BATCH = 512
+"""Transitions a batch of each member. ours."""
+HELD_ACTIONS = 5
+"""Steps that the held policy's members take as one transition; its action is the mean of as many [steps]. ours."""
+HELD_MEMBERS = 3
+"""Members of the held policy. ours."""
 CLOSE = 1e-4
 """Squared distance of actions, averaged over A, within which the distance has no edge."""
 
@@ -45,7 +51,7 @@ class Members(nn.Module):
         self.config, self.sampler, self.bound = config, sampler, model.bound
         shape, action = model.config, model.action_dim
         latent = shape.width(action)
-        self.count, self.n_global = config.held_members if hold > 1 else config.members, shape.n_global
+        self.count, self.n_global = HELD_MEMBERS if hold > 1 else config.members, shape.n_global
         self.data = held_transitions(sampler, hold, config.discount)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(generator.initial_seed() + (3 if hold > 1 else 2))
@@ -106,7 +112,7 @@ class Members(nn.Module):
     def draw(self, members: int, generator: torch.Generator) -> Tensor:
         """Rows of transitions from all over the data: int64 [members, B]."""
         pool = self.sampler.transitions
-        return pool[torch.randint(len(pool), (members, self.config.latent_value_batch), generator=generator,
+        return pool[torch.randint(len(pool), (members, BATCH), generator=generator,
                                   device=pool.device)]
 
     def blur(self, cache: Tensor, rows: Tensor, generator: torch.Generator) -> Tensor | float:

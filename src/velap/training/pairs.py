@@ -58,6 +58,8 @@ class Pairs(nn.Module):
 
     HIDDEN = (256, 256)
     """Layers of the inverse model."""
+    REACH = 20
+    """Most steps between the two states of a pair [steps]. ours."""
 
     def __init__(self, model: LatentModel, config: TrainConfig, sampler: WindowSampler, generator: torch.Generator) -> None:
         super().__init__()
@@ -74,16 +76,11 @@ class Pairs(nn.Module):
         what lags behind its commands has gone as far as that mean says."""
 
     def draw(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Rows int64 [P] of a state and of one at most `encoder_reach` steps later in the same episode."""
-        sampler, shape, reach = self.sampler, (self.config.encoder_pairs,), self.config.encoder_reach
+        """Rows int64 [P] of a state and of one at most `REACH` steps later in the same episode."""
+        sampler, shape = self.sampler, (self.config.encoder_pairs,)
         pool, device = sampler.transitions, sampler.device
         now = pool[torch.randint(len(pool), shape, generator=generator, device=device)]
-        if self.config.encoder_rewarded_share > 0 and len(sampler.rewarded):
-            row = sampler.rewarded[torch.randint(len(sampler.rewarded), shape, generator=generator, device=device)]
-            before = torch.randint(reach, shape, generator=generator, device=device)
-            chosen = torch.rand(shape, generator=generator, device=device) < self.config.encoder_rewarded_share
-            now = torch.where(chosen, torch.maximum(row - before, sampler.first[row]), now)
-        ahead = torch.randint(1, reach + 1, shape, generator=generator, device=device)
+        ahead = torch.randint(1, self.REACH + 1, shape, generator=generator, device=device)
         return now, torch.minimum(now + ahead, sampler.last[now])
 
     def displacement(self, latents: Tensor, now: Tensor, then: Tensor) -> tuple[Tensor, Tensor]:

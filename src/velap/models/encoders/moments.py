@@ -96,7 +96,6 @@ class MomentEncoder(nn.Module):
         self.moments = ColourMoments(config.moment_colours, size)
         moments, learnt = 6 * config.moment_colours, config.learnt_dim
         self.dense = MLP(moments * config.frame_stack, config.encoder_dense, learnt, config.norm)
-        self.final_norm = nn.LayerNorm(learnt, elementwise_affine=False) if config.latent_norm else nn.Identity()
         self.slow_features, self.keep_moments = config.slow_features, config.keep_moments
         """S, dimensions of the latent behind those that are learnt, and whether the moments stand behind these."""
         if config.slow_features > 0:
@@ -124,7 +123,7 @@ class MomentEncoder(nn.Module):
     def learnt(self, moments: Tensor) -> Tensor:
         """What the dense layers make of standardised moments of a stack: [M, N, C] → [M, D less what is kept]."""
         newest = moments[:, -1:]
-        return self.final_norm(self.dense(torch.cat([newest, newest - moments[:, :-1]], 1).flatten(1)))
+        return self.dense(torch.cat([newest, newest - moments[:, :-1]], 1).flatten(1))
 
     @torch.no_grad()
     def keep_slow(self, mean: Tensor, directions: Tensor) -> None:
