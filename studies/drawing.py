@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from studies.bake_meshes import SITES
+from velap.envs.pixels import FRAME_SIZE, Frame, shared_renderer
+from velap.envs.sawyer.scene import SHOWN_GROUPS, VIEW
+from velap.envs.sawyer.view import View
 from velap.runs import storage_errors
 from velap.tasks import get_task
 
@@ -26,6 +31,26 @@ EVERY = 10
 """Steps between two compared states [steps]."""
 GAIN = 4
 """How much brighter the picture shows a difference."""
+
+
+_numbers = count()
+
+
+class OriginalScene:
+    """The same view of Meta-World's own geometry, without shadows, reflections and goal marks; slow, to compare with."""
+
+    def __init__(self, model: Any, view: View = VIEW) -> None:
+        self.model, self.view = model.__copy__(), view
+        for site in range(model.nsite):
+            self.model.site_group[site] = 0 if model.site(site).name in SITES else SHOWN_GROUPS
+        self.model.cam_fovy[0] = view.fovy
+        self._assets = f"original scene {next(_numbers)}"
+
+    def draw(self, model: Any, data: Any, size: int = FRAME_SIZE) -> Frame:
+        """The view of a state of the model, an owned uint8 [size, size, 3]."""
+        state = data.__copy__()
+        state.cam_xpos[0], state.cam_xmat[0] = self.view.position, self.view.axes.T.ravel()
+        return shared_renderer(self._assets, self.model, size).draw(self.model, state, camera=0)
 
 
 @dataclass(frozen=True)
@@ -56,8 +81,6 @@ class Comparison:
 
 def compare(task: str, seeds: Sequence[int] = SEEDS, every: int = EVERY) -> Comparison:
     """Draw test episodes of the expert both ways, every so many steps, start and success included."""
-    from velap.envs.sawyer.scene import OriginalScene
-
     env: Any = gym.make(f"velap.envs:{get_task(task).env_id}").unwrapped
     original = OriginalScene(env.model)
     pairs = [(original.draw(env.model, env.data), env.render()) for seed in seeds for _ in _states(env, seed, every)]

@@ -79,22 +79,6 @@ def test_forked_environments_draw_the_same_frames_as_their_parent():
     np.testing.assert_array_equal(frames, np.stack([first, first]))
 
 
-def test_stacks_repeat_the_first_frame_then_slide():
-    env = pixels.stack_frames(make("SpiralMaze"), 3)
-    assert env.observation_space.shape == (3, 64, 64, 3)
-    first, _ = env.reset(seed=0)
-    np.testing.assert_array_equal(first, np.stack([first[2]] * 3))
-    stacks = [env.step(np.array([1, 0], np.float32))[0] for _ in range(4)]
-    newest = [first[2], *(stack[2] for stack in stacks)]
-    np.testing.assert_array_equal(stacks[0], np.stack([newest[0], newest[0], newest[1]]))
-    np.testing.assert_array_equal(stacks[3], np.stack(newest[2:5]))
-    assert not np.array_equal(newest[3], newest[4])
-    again, _ = env.reset(seed=0)
-    np.testing.assert_array_equal(again, first)
-    with pytest.raises(ConfigError, match="at least 1"):
-        pixels.stack_frames(make("SpiralMaze"), 0)
-
-
 def test_a_black_frame_is_an_error_that_names_the_packages(monkeypatch):
     env = make("SpiralMaze")
     monkeypatch.setattr(pixels.mujoco, "mjr_readPixels", lambda rgb, *_: rgb.fill(0))
@@ -102,36 +86,43 @@ def test_a_black_frame_is_an_error_that_names_the_packages(monkeypatch):
         env.reset(seed=0)
 
 
+def failing(*broken: str):
+    return lambda backend: f"no library for {backend}" if backend in broken else None
+
+
+def test_the_first_backend_that_draws_is_chosen_and_set(monkeypatch):
+    for broken, chosen in ((), "egl"), (("egl",), "osmesa"), (("egl", "osmesa"), "glfw"):
+        monkeypatch.setenv("MUJOCO_GL", "on")
+        monkeypatch.setattr(gl, "_probe", failing(*broken))
+        assert gl.choose_backend() == chosen == os.environ["MUJOCO_GL"]
+
+
 def test_every_failed_backend_is_named_with_its_reason(monkeypatch):
-    def broken(name: str) -> None:
-        raise ImportError(f"no library for {name}")
-
-    monkeypatch.setattr(gl, "_working", [])
-    monkeypatch.setattr(gl, "_forget_platform", lambda platform: None)
-    monkeypatch.setattr(gl.importlib, "import_module", broken)
-    monkeypatch.setattr(gl, "backend_order", lambda: gl.BACKENDS)
-    with pytest.raises(RenderError, match=r"mujoco\.egl;.*mujoco\.osmesa;.*mujoco\.glfw.*libosmesa6"):
-        gl.make_context(None, 64)
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.setattr(gl, "_probe", failing(*gl.BACKENDS))
+    with pytest.raises(RenderError, match=r"library for egl; osmesa: .*; glfw: .*\(MUJOCO_GL is unset.*libosmesa6"):
+        gl.choose_backend()
+    assert "MUJOCO_GL" not in os.environ
 
 
-@pytest.mark.parametrize(
-    ("setting", "order"), [(None, gl.BACKENDS), ("", gl.BACKENDS), ("EGL", ("egl",)), ("osmesa", ("osmesa",))]
-)
-def test_mujoco_gl_decides_where_it_is_set(monkeypatch, setting, order):
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    if setting is not None:
+def test_the_setting_decides_where_it_names_a_backend(monkeypatch):
+    monkeypatch.setattr(gl, "_probe", failing(*gl.BACKENDS))
+    for setting in ("EGL", " osmesa"):
         monkeypatch.setenv("MUJOCO_GL", setting)
-    monkeypatch.setattr(gl, "_egl_draws", lambda: True)
-    assert gl.backend_order() == order
+        assert gl.choose_backend() == setting.lower().strip()
 
 
-def test_a_broken_egl_is_not_tried_where_osmesa_can_draw(monkeypatch):
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(gl, "_egl_draws", lambda: False)
-    monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: "libOSMesa.so.8")
-    assert gl.backend_order() == ("osmesa", "glfw")
-    monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: None)
-    assert gl.backend_order() == gl.BACKENDS
+def test_a_probe_says_why_a_backend_does_not_draw(monkeypatch):
+    assert gl._probe(gl.working_backend()) is None
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "99")
+    monkeypatch.setenv("DISPLAY", "")
+    assert "MUJOCO_EGL_DEVICE_ID" in gl._probe("egl")
+
+
+def test_a_backend_that_fails_after_all_is_an_error_that_names_it(monkeypatch):
+    monkeypatch.setattr(gl, "_working", ["none"])
+    with pytest.raises(RenderError, match=r"backend none does not work here: ModuleNotFoundError.*libosmesa6"):
+        gl.make_context(None, 64)
 
 
 @pytest.mark.parametrize("setting", ["disable", "nonsense"])

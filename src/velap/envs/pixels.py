@@ -1,4 +1,4 @@
-"""Pixel tasks: one frame an observation, a sparse 0/1 reward that ends the episode; rendering and frame stacking.
+"""Pixel tasks: one frame an observation, a sparse 0/1 reward that ends the episode; rendering.
 
 Shapes: frames are uint8 [H, W, 3], RGB, first row at the top.
 """
@@ -10,7 +10,6 @@ import operator
 import os
 import threading
 from abc import abstractmethod
-from collections import deque
 from typing import Any, ClassVar
 
 import gymnasium
@@ -170,36 +169,3 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
     def render(self, size: int = FRAME_SIZE) -> Frame:
         """The static camera's view, uint8 [size, size, 3], owned by the caller."""
         return shared_renderer(self.assets, self.model, size).draw(self.model, self.data)
-
-
-class FrameStack(gymnasium.ObservationWrapper[NDArray[np.uint8], NDArray[np.float32], Frame]):
-    """The last `count` frames, uint8 [count, H, W, 3], oldest first; the first stands in for those before the episode."""
-
-    def __init__(self, env: gymnasium.Env[Frame, NDArray[np.float32]], count: int) -> None:
-        super().__init__(env)
-        if count < 1:
-            raise ConfigError(f"frame stack is {count}; expected at least 1 frame.")
-        space = env.observation_space
-        assert isinstance(space, gymnasium.spaces.Box)
-        self.count = count
-        self.observation_space = gymnasium.spaces.Box(0, 255, (count, *space.shape), np.uint8)
-        self._frames: deque[Frame] = deque(maxlen=count)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Frame, dict[str, Any]]:
-        """Forget the last episode."""
-        self._frames.clear()
-        return super().reset(seed=seed, options=options)
-
-    def observation(self, observation: Frame) -> NDArray[np.uint8]:
-        """The stack that ends with this frame."""
-        from velap.data.frames import stack_indices
-
-        self._frames.append(observation)
-        # a deque that is not full begins with the episode's first frame, a full one never looks further back
-        rows = stack_indices(np.array(len(self._frames) - 1), np.array(0), self.count)
-        return np.stack([self._frames[row] for row in np.asarray(rows)])
-
-
-def stack_frames(env: gymnasium.Env[Frame, NDArray[np.float32]], count: int) -> FrameStack:
-    """`env` with observations uint8 [count, H, W, 3]."""
-    return FrameStack(env, count)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from velap.envs.gl import mujoco
 from velap.envs.pixels import FRAME_SIZE, Frame, PixelTask
-from velap.envs.sawyer.scene import SawyerScene
+from velap.envs.sawyer.scene import SawyerScene, load_drawing
 from velap.errors import ConfigError, VelapError
 
 ACTION_SCALE = 0.01
@@ -217,7 +217,7 @@ _CONTEXT_STREAMS = {"train": 20231106, "test": 20231107}
 @cache
 def _shared_scene(process: int, thread: int, task: Any) -> SawyerScene:
     """The drawing model of a task in this process and thread: a context belongs to one thread, and a fork makes its own."""
-    return SawyerScene(_prepared(task)[0])
+    return SawyerScene(load_drawing(task.assets), _prepared(task)[0])
 
 
 def settle(model: Any, data: Any, position: Vector | tuple[float, ...], steps: int) -> None:

@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from velap.envs.sawyer.meshes import Array, Mesh, face_normals
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,3 @@ class View:
         right, up, back = np.moveaxis((points - np.asarray(self.position)) @ self.axes.T, -1, 0)
         scale = size / 2 / np.tan(np.radians(self.fovy / 2)) / -back
         return np.stack([size / 2 + scale * right, size / 2 - scale * up], axis=-1)
-
-    def facing(self, mesh: Mesh) -> Mesh:
-        """The triangles (in the world's frame) that turn their front to the camera and are not wholly beside the frame."""
-        towards = np.einsum("ij,ij->i", face_normals(mesh.corners), mesh.corners[:, 0] - self.position) < 0
-        beside = np.any(np.all(self.depths(mesh.corners) < 0, axis=1), axis=1)
-        return mesh.kept(towards & ~beside)

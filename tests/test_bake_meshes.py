@@ -1,12 +1,13 @@
-"""Triangle meshes: closed and outward, simplified without losing their shape."""
+"""Baking: triangle meshes are closed and outward, simplified without losing their shape; the shipped file is what is baked."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from velap.envs.sawyer import meshes
-from velap.envs.sawyer.meshes import Mesh, face_normals, merged, simplified
+from studies import bake_meshes as meshes
+from studies.bake_meshes import Mesh, face_normals, facing, merged, simplified
+from velap.envs.sawyer.scene import load_drawing
 from velap.envs.sawyer.view import View
 
 
@@ -102,6 +103,20 @@ def test_a_view_projects_to_pixels_and_knows_what_is_beside_it() -> None:
     assert view.beside(centres, quarter @ still, halves).tolist() == [True, False, False, True]
     assert view.beside(centres, still, np.array([[0.01, 0.01, 9.0]] * 4)).tolist() == [True, True, False, True]
     cube = meshes.box(np.full(3, 0.1))
-    seen = view.facing(merged([cube, cube.moved(np.array([0.0, 9.0, 0.0]), np.eye(3))]))
+    seen = facing(view, merged([cube, cube.moved(np.array([0.0, 9.0, 0.0]), np.eye(3))]))
     assert len(seen) == 2
     np.testing.assert_allclose(seen.corners[..., 0], 0.1)
+
+
+def test_the_shipped_drawings_are_what_the_script_bakes() -> None:
+    for name, made in meshes.bake().items():
+        shipped = load_drawing(name)
+        assert [(part.body, len(part.corners)) for part in shipped.parts] == [(p.body, len(p.corners)) for p in made.parts]
+        for part, expected in zip(shipped.parts, made.parts, strict=True):
+            assert part.look == expected.look
+            np.testing.assert_allclose(part.corners, expected.corners, atol=1e-6)
+            np.testing.assert_allclose(part.normals, expected.normals, atol=1e-4)
+        for block, box in zip(shipped.blocks, made.blocks, strict=True):
+            assert block.look == box.look
+            np.testing.assert_array_equal(block.texture, box.texture)
+            np.testing.assert_allclose([*block.position, *block.half_size], [*box.position, *box.half_size], atol=1e-12)
