@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import gymnasium as gym
@@ -15,11 +16,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from velap import threads
 from velap.data import behaviours, minari_io
 from velap.data import card as cards
 from velap.data import collection as collect
 from velap.data.frames import FrameStore, load_positions, load_store
-from velap.data.pool import Worker
+from velap.data.worker import Shard, Workers
 from velap.errors import DatasetError, RenderError, StorageError, UnknownTaskError
 from velap.tasks import Recipe, Task
 
@@ -42,6 +44,8 @@ class Line(gym.Env):
 
     def _frame(self):
         frame = np.full((64, 64, 3), 30 + self.context, np.uint8)
+        if os.environ.get("LINE_FAULT") == "other pixels":
+            frame[0, 0, 0] = os.getpid() % 251
         column, row = (self.place * 7.99).astype(int)
         frame[8 * row : 8 * row + 8, 8 * column : 8 * column + 8] = 250
         return frame
@@ -56,6 +60,8 @@ class Line(gym.Env):
         time.sleep(float(os.environ.get("LINE_DELAY", 0)))
         if os.environ.get("LINE_FAULT") == "render":
             raise RenderError("the driver is missing; expected EGL. Install libegl1.")
+        if os.environ.get("LINE_FAULT") == "die":
+            os._exit(9)
         if os.environ.get("LINE_FAULT") == "crash":
             raise ZeroDivisionError("a bug of the environment")
         self.place = np.clip(self.place + 0.05 * np.asarray(action), 0, 1)
@@ -206,7 +212,7 @@ def test_workers_end_with_a_killed_parent(root: Path):
     process = start(root, delay=0.02)
     wait_for(lambda: list((root / "velap" / ".Line-v0.partial" / "shards").glob("0*.npz")))
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    assert len(children) == 2
+    assert len(children) >= 2  # two workers, and what keeps count of their resources
     process.kill()
     process.communicate()
     wait_for(lambda: not any(Path(f"/proc/{child}/cmdline").exists() and Path(f"/proc/{child}/cmdline").read_bytes()
@@ -275,7 +281,8 @@ def test_two_collections_at_once_are_refused(root: Path):
 
 
 @pytest.mark.parametrize(("fault", "kind", "match"), [
-    ("render", RenderError, "Install libegl1"), ("crash", DatasetError, "a bug of the environment"),
+    ("render", RenderError, "Install libegl1"), ("crash", DatasetError, "ZeroDivisionError: a bug of the environment"),
+    ("die", DatasetError, "ended by itself.*--workers 1 if memory was short"),
 ])
 def test_faults_of_the_environment_arrive(root: Path, monkeypatch: pytest.MonkeyPatch, fault: str, kind: type, match: str):
     monkeypatch.setenv("LINE_FAULT", fault)
@@ -297,18 +304,29 @@ def test_a_full_disk_keeps_what_is_finished(root: Path):
 
 
 def test_what_killed_workers_were_writing_is_deleted(root: Path, monkeypatch: pytest.MonkeyPatch):
-    shards = root / "velap" / ".Line-v0.partial" / "shards"
+    shards, all_of_them = root / "velap" / ".Line-v0.partial" / "shards", Workers.collect
 
-    def one_fails(running: list[Worker], *_: object) -> None:
-        running[1].ask(kind="shard", name="00000-000000.npz", context=0, first=0, count=10)
-        running[1].answer()
-        (shards / ".00000-000010.npz.tmp").write_bytes(b"half a shard")
+    def one_fails(self: Workers, pending: list[Shard], fingerprint: str) -> Iterator[int]:
+        yield from all_of_them(self, pending[:1], fingerprint)
+        (shards / ".00000-000004.npz.tmp").write_bytes(b"half a shard")
         raise OSError(errno.EFBIG, "File too large")
 
-    monkeypatch.setattr(collect, "run_all", one_fails)
+    monkeypatch.setattr(Workers, "collect", one_fails)
     with pytest.raises(StorageError, match="File too large"):
         collect.collect(TASK, seed=3, workers=2)
     assert [path.name for path in shards.iterdir()] == ["00000-000000.npz"]
+
+
+def test_a_machine_that_does_not_tell_its_cores_collects(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert threads.usable_cores() == os.cpu_count()
+    assert collect.collect(dataclasses.replace(TASK, recipe=Recipe(1, 4, 2, 1.0))).episodes == 4
+
+
+def test_processes_that_see_other_pixels_are_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("LINE_FAULT", "other pixels")
+    with pytest.raises(DatasetError, match="different frames.*--workers 1"):
+        collect.collect(TASK, workers=2)
 
 
 # the card

@@ -1,7 +1,8 @@
-"""How many threads PyTorch uses on a CPU: small work is faster on one, the others only spin beside it."""
+"""How many cores there are, and how many threads PyTorch uses: small work is faster on one, the others only spin beside it."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -9,6 +10,12 @@ import torch
 
 TRANSITIONS_A_THREAD = 512
 """Transitions of a batch up to which heads learn on one thread of a CPU. ours."""
+
+
+def usable_cores() -> int:
+    """Cores that this process may use; where the system does not tell (macOS, Windows), all of the machine."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 @contextmanager

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 import time
 import zipfile
@@ -24,10 +23,11 @@ from velap.data import card as cards
 from velap.data import minari_io
 from velap.data.behaviours import mixture, reset_options
 from velap.data.frames import Extras, FrameStore, make_store, write_dataset
-from velap.data.pool import Progress, Worker, run_all, workers
+from velap.data.worker import Job, Progress, Shard, describe, test_starts, workers
 from velap.errors import DatasetError, StorageError
 from velap.storage import replace_file
 from velap.tasks import Task, get_task
+from velap.threads import usable_cores
 
 SHARD_TRAJECTORIES = 10
 """Trajectories a shard: what a kill costs at most, a worker. ours."""
@@ -65,23 +65,13 @@ class CollectResult:
         return 100.0 * self.successes / self.transitions
 
 
-@dataclass(frozen=True)
-class _Shard:
-    """Trajectories `first` to `first + count - 1` of a context."""
-
-    name: str
-    context: int
-    first: int
-    count: int
-
-
-def _shards(task: Task) -> list[_Shard]:
+def _shards(task: Task) -> list[Shard]:
     recipe = task.recipe
-    return [_Shard(f"{context:05d}-{first:06d}.npz", context, first, min(SHARD_TRAJECTORIES, recipe.trajectories - first))
+    return [Shard(f"{context:05d}-{first:06d}.npz", context, first, min(SHARD_TRAJECTORIES, recipe.trajectories - first))
             for context in range(recipe.contexts) for first in range(0, recipe.trajectories, SHARD_TRAJECTORIES)]
 
 
-def _finished(path: Path, shard: _Shard) -> bool:
+def _finished(path: Path, shard: Shard) -> bool:
     """Is the shard there, whole and readable?"""
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -91,7 +81,7 @@ def _finished(path: Path, shard: _Shard) -> bool:
     return len(arrays["length"]) == shard.count and len(arrays["frames"]) == int((arrays["length"] + 1).sum())
 
 
-def _assemble(directory: Path, shards: list[_Shard], description: dict[str, Any],
+def _assemble(directory: Path, shards: list[Shard], description: dict[str, Any],
               dataset_id: str) -> tuple[FrameStore, dict[str, np.ndarray]]:
     """The store of all shards in order, and the arrays that a store does not hold. Frames are copied once."""
     lengths = []
@@ -151,18 +141,6 @@ def _forget_finished(work: Path, dataset_id: str) -> None:
             shutil.rmtree(work, ignore_errors=True)
 
 
-def _describe(running: list[Worker], env_id: str) -> dict[str, Any]:
-    """What the workers say of the environment, once it is certain that they all see the same pixels."""
-    for worker in running:
-        worker.ask(kind="describe")
-    descriptions = [worker.answer() for worker in running]
-    if len({description["fingerprint"] for description in descriptions}) > 1:
-        raise DatasetError(f"two processes got different frames from {env_id} for one seed; expected equal ones. The "
-                           "environment or "
-                           "the renderer is not deterministic: use another renderer (MUJOCO_GL=osmesa, say) or --workers 1.")
-    return descriptions[0]
-
-
 def _composition(store: FrameStore, arrays: dict[str, np.ndarray], names: list[str]) -> dict[str, Any]:
     """For the card: trajectories of each context; trajectories and successes by behaviour; how many lead from where tests
     start to a success."""
@@ -200,20 +178,22 @@ def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, 
 def _collect(task: Task, seed: int, count: int, dataset_id: str, resume: bool, progress: Progress,
              command: str) -> CollectResult:
     began, work, shards = time.monotonic(), minari_io.partial_path(dataset_id), _shards(task)
-    recipe, shares = dataclasses.asdict(task.recipe), mixture(task.name)
-    job = {"env_id": task.env_id, "recipe": recipe, "shares": shares, "seed": seed, "shards": str(work / "shards")}
+    shares = mixture(task.name)
+    job = Job(task.env_id, task.recipe, tuple(shares.items()), seed, work / "shards")
     try:
-        with workers(count, job, work) as running:
-            description = _describe(running, task.env_id)
-            plan = {"task": task.name, "env_id": task.env_id, "seed": seed, "recipe": recipe, "shares": shares,
-                    "fingerprint": description["fingerprint"]}
+        with workers(count, job) as running:
+            description = running.call(describe)
+            plan = {"task": task.name, "env_id": task.env_id, "seed": seed, "recipe": dataclasses.asdict(task.recipe),
+                    "shares": shares, "fingerprint": description["fingerprint"]}
             notes = _prepare(work, plan, resume)
             pending = [shard for shard in shards if not _finished(work / "shards" / shard.name, shard)]
             total = sum(shard.count for shard in shards)
-            resumed = total - sum(shard.count for shard in pending)
-            run_all(running, [{"kind": "shard", **dataclasses.asdict(shard)} for shard in pending], resumed, total, progress)
-            running[0].ask(kind="test_starts")
-            starts = running[0].answer()["test_starts"]
+            resumed = done = total - sum(shard.count for shard in pending)
+            progress(done, total)
+            for finished in running.collect(pending, plan["fingerprint"]):
+                done += finished
+                progress(done, total)
+            starts = running.call(test_starts)
     finally:
         _sweep(work / "shards")  # an error of one worker ends the others in the middle of their files
     provenance = {"plan": plan, "command": command, "test_starts": starts, "extent": description["extent"]}
@@ -243,7 +223,7 @@ def collect(task: str | Task, seed: int = 0, workers: int | None = None, dataset
     """
     task = get_task(task) if isinstance(task, str) else task
     dataset_id = dataset_id or task.dataset_id
-    count = max(1, min(workers or len(os.sched_getaffinity(0)), len(_shards(task))))
+    count = max(1, min(workers or usable_cores(), len(_shards(task))))
     command = command or f"velap collect {task.name} --seed {seed}"
     work = minari_io.partial_path(dataset_id)
     try:

@@ -9,10 +9,8 @@ from __future__ import annotations
 import contextlib
 import difflib
 import errno
-import fcntl
 import hashlib
 import json
-import os
 import shutil
 import struct
 from collections.abc import Iterator
@@ -20,12 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from filelock import FileLock, Timeout
 from minari.dataset.minari_dataset import DATASET_ID_RE, MinariDataset
 from minari.namespace import create_namespace, list_local_namespaces
 from minari.storage.datasets_root_dir import get_dataset_path
 from minari.storage.local import list_local_datasets
 
 from velap.errors import DatasetError, StorageError
+from velap.storage import sync
 
 UNREADABLE = (
     OSError, KeyError, ValueError, RuntimeError, TypeError, AssertionError, IndexError, AttributeError, EOFError,
@@ -83,14 +83,6 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _fsync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def make_namespace(dataset_id: str) -> None:
     """Create the Minari namespace of `dataset_id` where it is missing."""
     namespace = DATASET_ID_RE.fullmatch(dataset_id).group("namespace")
@@ -106,12 +98,12 @@ def _old(target: Path) -> Path:
 def install(built: Path, target: Path) -> None:
     """Rename the finished dataset `built` to `target`; a dataset that was there is deleted once the new one is in place."""
     for path in [*built.rglob("*"), built]:
-        _fsync(path)
+        sync(path)
     shutil.rmtree(_old(target), ignore_errors=True)
     if target.exists():
         target.rename(_old(target))
     built.rename(target)
-    _fsync(target.parent)
+    sync(target.parent)
     shutil.rmtree(_old(target), ignore_errors=True)
 
 
@@ -135,14 +127,16 @@ def refuse_existing(dataset_id: str, overwrite: bool) -> None:
 def exclusive(directory: Path, dataset_id: str) -> Iterator[None]:
     """Hold the lock of a work directory; the kernel releases it however the process ends."""
     directory.mkdir(parents=True, exist_ok=True)
-    with (directory / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise StorageError(f"another process is writing {dataset_id} (it holds {directory / 'lock'}); expected to be "
-                               "alone. "
-                               "Wait for it or stop it, then run the same command again.") from error
+    lock = FileLock(directory / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise StorageError(f"another process is writing {dataset_id} (it holds {directory / 'lock'}); expected to be alone. "
+                           "Wait for it or stop it, then run the same command again.") from error
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def read_metadata(dataset_id: str) -> dict[str, Any]:
