@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Everything velap needs on a fresh Debian or Ubuntu machine: Python, a virtual environment in .venv, the packages of
-# constraints.txt and a software OpenGL. Safe to repeat; a second run does nothing unless pyproject.toml or constraints.txt changed.
+# constraints.txt, a software OpenGL and a C compiler. Safe to repeat; a second run does nothing unless pyproject.toml or constraints.txt changed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -60,6 +60,9 @@ if ! draws >/dev/null 2>&1; then
     system_packages libegl1 libgl1-mesa-dri
     draws || { echo "velap still cannot draw; the lines above say why." >&2; exit 1; }
 fi
+
+# Plans are twice as fast with velap's C code, which is built at first use.
+command -v cc >/dev/null || command -v gcc >/dev/null || command -v clang >/dev/null || system_packages gcc libc6-dev
 
 echo "$wanted" > "$stamp"
 say "ready"

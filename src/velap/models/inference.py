@@ -72,7 +72,7 @@ def joined(network: MLP | EnsembleMLP, hidden: torch.dtype | None = None) -> Cal
     """The network on inputs side by side, `[*, W_1], [*, W_2], ...`, by `kernels.c` where it pays. Copies the weights.
 
     Gives `[*, outputs]` of an MLP and `[n, *]` of an ensemble, equal in eval mode, without gradients (and without tanh).
-    `hidden` folds normalisation for PyTorch as well, and runs the layers behind the first in that type.
+    `hidden` runs the layers behind the first in that type, in PyTorch where it is not float32.
     """
     fast = _by_torch(network, hidden)
 
@@ -80,7 +80,8 @@ def joined(network: MLP | EnsembleMLP, hidden: torch.dtype | None = None) -> Cal
         out = fast(torch.cat(parts, -1) if len(parts) > 1 else parts[0])
         return out.unsqueeze(-1) if isinstance(network, EnsembleMLP) else out
 
-    run = native_network(fold(dense_layers(network)), by_torch, half=hidden == torch.bfloat16)
+    half = hidden not in (None, torch.float32)
+    run = by_torch if half else native_network(fold(dense_layers(network)), by_torch)
     return (lambda *parts: run(*parts).squeeze(-1)) if isinstance(network, EnsembleMLP) else run
 
 

@@ -1,8 +1,8 @@
 """`kernels.c`: networks on a few dozen rows, where PyTorch spends its time between the kernels.
 
-The C compiler of the machine builds it at first use, into the user's cache; without a compiler, and on other devices than a
-CPU, the networks of `inference.py` run, slower and equal up to rounding. `VELAP_NATIVE=0` turns it off. W inputs, V outputs,
-n members.
+The C compiler of the machine builds it at first use, into the user's cache. Without a compiler a warning says how to install one
+and the networks of `inference.py` run, equal up to rounding and about half as fast a plan; so they do on other devices than a CPU.
+`VELAP_NATIVE=0` turns it off, without a warning. W inputs, V outputs, n members.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -27,15 +28,14 @@ from velap.storage import replace_file
 
 PANEL = 32
 """Columns of a weight panel, as in kernels.c."""
-TILE_INPUTS = 32
-"""Inputs are padded to a multiple of this in bfloat16, as in kernels.c."""
-MOST_TILED = 1024
-"""Units of a layer up to which tiles are used: a block of 32 rows has to fit on the stack. ours."""
 MOST_ROWS = 2048
 """Rows of a call up to which one thread of kernels.c is at least as fast as PyTorch on two cores. ours."""
 MOST_UNITS = 4096
 """Units of a layer up to which kernels.c is used: a block of rows has to fit on the stack. ours."""
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-shared", "-fPIC")
+COMPILERS = ("cc", "gcc", "clang")
+_ADVICE = ("Install a compiler (Debian and Ubuntu: apt-get install gcc libc6-dev; macOS: xcode-select --install) or name one "
+           "with CC; VELAP_NATIVE=0 silences this.")
 _SOURCE = Path(__file__).with_name("kernels.c")
 
 
@@ -43,20 +43,28 @@ class _Layer(ctypes.Structure):
     """`Layer` of kernels.c."""
 
     _fields_ = (("inputs", ctypes.c_long), ("outputs", ctypes.c_long), ("weights", ctypes.c_void_p),
-                ("bias", ctypes.c_void_p), ("shift", ctypes.c_void_p), ("halves", ctypes.c_void_p),
-                ("lows", ctypes.c_void_p))
+                ("bias", ctypes.c_void_p), ("shift", ctypes.c_void_p))
 
 
 @cache
 def library() -> ctypes.CDLL | None:
-    """The compiled code; None where it is turned off or cannot be built."""
-    compiler = next(filter(None, map(shutil.which, filter(None, (os.environ.get("CC"), "cc", "gcc", "clang")))), None)
-    if os.environ.get("VELAP_NATIVE") == "0" or compiler is None or platform.system() == "Windows":
+    """The compiled code; None where it is turned off, and, with one warning, where it cannot be built."""
+    if os.environ.get("VELAP_NATIVE") == "0":
         return None
-    try:
-        return _declare(ctypes.CDLL(str(_build(compiler))))
-    except (OSError, subprocess.SubprocessError):
-        return None
+    named = os.environ.get("CC")
+    compiler = next(filter(None, map(shutil.which, [named] if named else COMPILERS)), None)
+    if platform.system() == "Windows":
+        problem = "velap's C code needs gcc or clang and a system other than Windows"
+    elif compiler is None:
+        problem = f"there is no C compiler here ({named or ', '.join(COMPILERS)})"
+    else:
+        try:
+            return _declare(ctypes.CDLL(str(_build(compiler))))
+        except (OSError, subprocess.SubprocessError) as error:
+            output = (getattr(error, "stderr", None) or b"").decode(errors="replace").strip().splitlines()
+            problem = f"{compiler} could not build {_SOURCE.name}: {output[0] if output else error}"
+    warnings.warn(f"{problem}; plans run in PyTorch, about half as fast. {_ADVICE}", UserWarning, stacklevel=2)
+    return None
 
 
 def _build(compiler: str) -> Path:
@@ -89,19 +97,14 @@ def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
     found.velap_rollout.argtypes = [address, number, address, number, address, address, number, number, number, ctypes.c_int,
                                     number, number, ctypes.c_float, ctypes.c_float, address]
     found.velap_network.restype = found.velap_rollout.restype = None
-    for question in (found.velap_halves, found.velap_tiles):
-        question.argtypes, question.restype = [], ctypes.c_int
     return found
 
 
-def _library_for(layers: Sequence[Folded], half: bool = False) -> ctypes.CDLL | None:
+def _library_for(layers: Sequence[Folded]) -> ctypes.CDLL | None:
     """The library, where it can run these layers."""
-    found = library()
-    wide = max(max(layer.weight.shape[-2:]) for layer in layers) > MOST_UNITS
-    if found is None or wide or (half and not found.velap_halves()):
-        return None
-    plain = all(part.dtype == torch.float32 and part.device.type == "cpu" for layer in layers for part in layer[:2])
-    return found if plain else None
+    fits = all(part.dtype == torch.float32 and part.device.type == "cpu" for layer in layers for part in layer[:2])
+    narrow = max(size for layer in layers for size in layer.weight.shape[-2:]) <= MOST_UNITS
+    return library() if fits and narrow else None
 
 
 def _width(layers: Sequence[Folded]) -> int:
@@ -109,22 +112,19 @@ def _width(layers: Sequence[Folded]) -> int:
     return max(-(-size // PANEL) * PANEL for layer in layers for size in layer.weight.shape[-2:])
 
 
-def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor], half: bool = False) -> Callable[..., Tensor]:
+def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Inputs `[*, W_1], [*, W_2], ...`, taken side by side, → `[n, *, V]` of the members, or `[*, V]` of weights [W, V].
-
-    `half` multiplies in bfloat16 in all layers but the first, which keeps the precision of the latents (16 bits of it with
-    matrix tiles, AMX).
 
     `otherwise` gets what kernels.c cannot take (other devices and types, more rows than pay) and must give the same. The
     weights are copied.
     """
-    found = _library_for(layers, half)
+    found = _library_for(layers)
     if found is None:
         return otherwise
     single = layers[0].weight.dim() == 2
     members = 1 if single else len(layers[0].weight)
     width = _width(layers)
-    kept, structs = _pack(layers, members, half, tiled=half and width <= MOST_TILED and bool(found.velap_tiles()))
+    kept, structs = _pack(layers, members)
     outputs, inputs = layers[-1].weight.shape[-1], layers[0].weight.shape[-2]
     run, fixed = found.velap_network, (ctypes.addressof(structs), members, len(layers))
 
@@ -175,12 +175,8 @@ def native_rollout(
 
 
 @torch.no_grad()
-def _pack(layers: Sequence[Folded], members: int, half: bool = False,
-          tiled: bool = False) -> tuple[list[Tensor], ctypes.Array[_Layer]]:
-    """Weights in panels, and the structs that point to them, member by member.
-
-    `half`: all but the first in bfloat16 as well; `tiled`: that too, and what bfloat16 leaves of its weights.
-    """
+def _pack(layers: Sequence[Folded], members: int) -> tuple[list[Tensor], ctypes.Array[_Layer]]:
+    """Weights in panels, and the structs that point to them, member by member."""
     kept: list[Tensor] = []
     structs = (_Layer * (members * len(layers)))()
     for index, layer in enumerate(layers):
@@ -195,18 +191,8 @@ def _pack(layers: Sequence[Folded], members: int, half: bool = False,
             if part is not None:
                 vectors[-1][:, :outputs] = part.reshape(members, outputs)
         kept += [panels, *vectors]
-        halves = _halves(panels) if half and (index > 0 or tiled) else None
-        lows = _halves(panels - panels.bfloat16()) if halves is not None and index == 0 else None
-        kept += [part for part in (halves, lows) if part is not None]
-        parts = (panels, vectors[0], vectors[1] if layer.shift is not None else None, halves, lows)
+        parts = (panels, vectors[0], vectors[1] if layer.shift is not None else None)
         for member in range(members):
             addresses = [None if part is None else part[member].data_ptr() for part in parts]
             structs[member * len(layers) + index] = _Layer(inputs, outputs, *addresses)
     return kept, structs
-
-
-def _halves(panels: Tensor) -> Tensor:
-    """Panels [members, P, W, PANEL] in bfloat16 by pairs of inputs, [members, P, W / 2, PANEL, 2], W padded with zeros."""
-    members, count, inputs, columns = panels.shape
-    padding = panels.new_zeros(members, count, -inputs % TILE_INPUTS, columns)
-    return torch.cat([panels, padding], 2).unflatten(2, (-1, 2)).transpose(3, 4).to(torch.bfloat16).contiguous()
