@@ -1,9 +1,9 @@
-"""Bakes what the four manipulation tasks draw: `python -m studies.bake_meshes` writes src/velap/envs/sawyer/assets/drawing.npz.
+"""Bakes what the four manipulation tasks draw: `python -m studies.bake_meshes` writes envs/sawyer/assets/drawing.npz.
 
-What a 64×64 frame of a camera that stands still cannot show is left out of Meta-World's scenes: collision geoms, fine relief of
-the arm's meshes, back faces of what never moves, and textures other than those of the static boxes (a part keeps the mean colour
-of its texture). Run it again after a change of Meta-World, of the view or of a task's scene; a test compares the file with what
-this script makes. Lengths are in metres.
+What a 64×64 frame of a camera that stands still cannot show is left out of Meta-World's scenes: collision geoms, fine relief
+of the arm's meshes, back faces of what never moves, and textures other than those of the static boxes (a part keeps the mean
+colour of its texture). Run it again after a change of Meta-World, of the view or of a task's scene; a test compares the file
+with what this script makes. Lengths are in metres.
 
 A mesh is a soup: every triangle has its three corners to itself, so that a corner's normal may differ from its neighbour's.
 

@@ -1,4 +1,4 @@
-"""Baking: triangle meshes are closed and outward, simplified without losing their shape; the shipped file is what is baked."""
+"""Baking: meshes are closed and outward, simplified without losing their shape; the shipped file is what is baked."""
 
 from __future__ import annotations
 

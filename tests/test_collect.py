@@ -325,7 +325,7 @@ def test_a_machine_that_does_not_tell_its_cores_collects(monkeypatch: pytest.Mon
 
 def test_processes_that_see_other_pixels_are_refused(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("LINE_FAULT", "other pixels")
-    with pytest.raises(DatasetError, match="different frames.*--workers 1"):
+    with pytest.raises(DatasetError, match=r"different frames.*--workers 1"):
         collect.collect(TASK, workers=2)
 
 

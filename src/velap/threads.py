@@ -1,4 +1,4 @@
-"""How many cores there are, and how many threads PyTorch uses: small work is faster on one, the others only spin beside it."""
+"""How many cores there are, and how many threads PyTorch uses on them: small work is faster on one thread."""
 
 from __future__ import annotations
 

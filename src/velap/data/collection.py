@@ -24,7 +24,7 @@ from velap.data import minari_io
 from velap.data.behaviours import mixture, reset_options
 from velap.data.frames import Extras, FrameStore, make_store, write_dataset
 from velap.data.worker import Job, Progress, Shard, describe, test_starts, workers
-from velap.errors import DatasetError, StorageError
+from velap.errors import StorageError
 from velap.storage import replace_file
 from velap.tasks import Task, get_task
 from velap.threads import usable_cores

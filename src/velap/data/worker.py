@@ -1,4 +1,4 @@
-"""What a collecting process does: it runs trajectories and leaves them as shards. `velap.data.collection` hands out the work.
+"""What a collecting process does: it runs trajectories and leaves them as shards; `velap.data.collection` hands them out.
 
 The processes are loky's: scripts need no main guard, and one that dies is noticed.
 """
@@ -118,9 +118,9 @@ def _named(function: Callable[..., Any], *arguments: Any) -> Any:
     except (VelapError, OSError):
         raise
     except Exception as error:
-        raise DatasetError(f"a collecting process failed: {type(error).__name__}: {' '.join(str(error).split())}. Expected it "
-                           "to finish its trajectories. Mend the environment; the finished ones are kept for the same "
-                           "command.") from error
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise DatasetError(f"a collecting process failed: {reason}. Expected it to finish its trajectories. Mend the "
+                           "environment; the finished trajectories are kept for the same command.") from error
 
 
 def _follow(parent: int) -> None:

@@ -1,8 +1,8 @@
 """`kernels.c`: networks on a few dozen rows, where PyTorch spends its time between the kernels.
 
-The C compiler of the machine builds it at first use, into the user's cache. Without a compiler a warning says how to install one
-and the networks of `inference.py` run, equal up to rounding and about half as fast a plan; so they do on other devices than a CPU.
-`VELAP_NATIVE=0` turns it off, without a warning. W inputs, V outputs, n members.
+The C compiler of the machine builds it at first use, into the user's cache. Without a compiler a warning says how to install
+one, and the networks of `inference.py` run, equal up to rounding; a plan then takes about twice as long. They also run on
+other devices than a CPU. `VELAP_NATIVE=0` turns the C code off, without a warning. W inputs, V outputs, n members.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ MOST_UNITS = 4096
 """Units of a layer up to which kernels.c is used: a block of rows has to fit on the stack. ours."""
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-shared", "-fPIC")
 COMPILERS = ("cc", "gcc", "clang")
-_ADVICE = ("Install a compiler (Debian and Ubuntu: apt-get install gcc libc6-dev; macOS: xcode-select --install) or name one "
-           "with CC; VELAP_NATIVE=0 silences this.")
+_ADVICE = ("Install a compiler (Debian and Ubuntu: apt-get install gcc libc6-dev; macOS: xcode-select --install) or name "
+           "one with CC; VELAP_NATIVE=0 silences this.")
 _SOURCE = Path(__file__).with_name("kernels.c")
 
 

@@ -1,7 +1,7 @@
 """Fast drawing of Meta-World's scenes in software: what a 64×64 frame of the one static camera can show, and nothing else.
 
-What shows was taken from Meta-World's scenes once (`studies/bake_meshes.py`) and is kept in `assets/drawing.npz`. A `SawyerScene`
-makes a drawing model of it, with the lights of the physics model; a frame copies body poses into it.
+What shows was taken from Meta-World's scenes once (`studies/bake_meshes.py`) and is kept in `assets/drawing.npz`. A
+`SawyerScene` makes a drawing model of it, with the lights of the physics model; a frame copies body poses into it.
 
 Letters: B bodies that carry something visible, P parts, F triangles, W texture width.
 """
