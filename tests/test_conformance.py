@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -143,8 +142,7 @@ def test_test_episodes_start_in_the_test_region_and_far_from_success(task):
 def test_a_stored_trajectory_replays_to_the_same_states_and_pixels(task, tmp_path, monkeypatch):
     """Action t leads from frame t to frame t + 1. Collected by the real thing, but in this process."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    monkeypatch.setattr(collect, "workers", in_this_process)
-    monkeypatch.setattr(collect, "run_all", one_after_the_other)
+    monkeypatch.setattr(worker, "ProcessPoolExecutor", InThisProcess)
     monkeypatch.setattr(worker, "TEST_STARTS", 2)
     monkeypatch.setitem(behaviours.BEHAVIOURS, "noisy-expert", noisy_expert)
     monkeypatch.setitem(behaviours.MIXTURES, task, {"noisy-expert": 1.0})
@@ -166,30 +164,19 @@ def test_a_stored_trajectory_replays_to_the_same_states_and_pixels(task, tmp_pat
         assert (np.ptp(store.frames[start : start + length + 1], axis=0) > 0).sum() > 20
 
 
-class Local:
-    """A collecting worker without a process of its own."""
+class InThisProcess:
+    """An executor without processes of its own."""
 
-    def __init__(self, job: dict[str, Any]) -> None:
-        self.env = worker.make_env(job["env_id"])
-        self.job = worker.Job(job["env_id"], Recipe(**job["recipe"]), job["shares"], job["seed"], Path(job["shards"]))
-        self.request: dict[str, Any] = {}
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
 
-    def ask(self, **request: Any) -> None:
-        self.request = request
+    def submit(self, function: Any, *arguments: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        done.set_result(function(*arguments))
+        return done
 
-    def answer(self) -> dict[str, Any]:
-        return worker._answer(self.env, self.job, self.request)
-
-
-@contextmanager
-def in_this_process(count: int, job: dict[str, Any], directory: Path) -> Iterator[list[Local]]:
-    yield [Local(job)]
-
-
-def one_after_the_other(running: Sequence[Local], requests: Sequence[dict[str, Any]], *_: Any) -> None:
-    for request in requests:
-        running[0].ask(**request)
-        running[0].answer()
+    def shutdown(self, **_: Any) -> None:
+        pass
 
 
 @pytest.mark.parametrize("seed", [0, 1, 4321])

@@ -96,7 +96,8 @@ def test_what_native_code_cannot_take_goes_to_torch():
 
 @pytest.mark.parametrize(("setting", "warned"), [
     ("VELAP_NATIVE=0", None), ("PATH=/nowhere", "there is no C compiler here"),
-    ("CC=/bin/false", "/bin/false could not build"), ("CC=no-such-compiler", "there is no C compiler here (no-such-compiler)"),
+    ("CC=/bin/false", "/bin/false could not build"),
+    ("CC=no-such-compiler", "there is no C compiler here (no-such-compiler)"),
 ])
 def test_without_native_code_the_same_comes_out_and_one_warning_says_so(setting, warned, tmp_path):
     code = """if True:
