@@ -1,0 +1,352 @@
+"""All that the golden tests need of velap's modules, and nothing else: when modules move, this file alone follows.
+
+The numbers in tests/golden stay as they are. T steps, A action dimension, F frames.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from velap import api
+from velap.agents.base import METHODS, make_agent, method_hash
+from velap.bench.evaluate import make_env
+from velap.bench.records import read_records, record_path
+from velap.bench.rollout import FrameReader
+from velap.config import Config, ModelConfig, override
+from velap.data.episodes import FrameStore
+from velap.models.heads import HEADS, SubgoalHead, load_head, make_head
+from velap.models.latent import LatentModel, load_checkpoint, shared_weights
+from velap.models.native import library
+from velap.runs import content_sha256, load_tensors, make_generator
+from velap.tasks import TASKS, make_config
+from velap.train_config import TrainConfig
+from velap.training.frozen import latent_data
+from velap.training.heads import RECIPES, learner_config, train_head
+from velap.training.loop import MODEL, STATE, Trainer, train
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+HEADED = tuple(HEADS)
+"""Methods that act by a head of their own."""
+ALL_METHODS = METHODS
+HEAD_SEEDS = {"bc": 7, "bc-success": 8, "iql": 9, "iql-sparse": 10, "iris": 11, "iris-multistep": 12}
+"""Seeds of the random weights of the heads in the traces, and of their learners."""
+HORIZONS = {"iris": 10, "iris-multistep": 5}
+"""Steps to a subgoal in those heads."""
+UPDATES = 20
+"""Recorded updates of a phase."""
+DECIMALS = 6
+"""Decimals of the actions in the traces."""
+
+
+def released(task: str) -> Path:
+    """The released checkpoint of a task."""
+    return REPOSITORY / "checkpoints" / f"{task}.safetensors"
+
+
+# Traces.
+
+
+@contextlib.contextmanager
+def pytorch_networks() -> Iterator[None]:
+    """Within, networks run in PyTorch on one thread, as the traces do."""
+    threads = torch.get_num_threads()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VELAP_NATIVE", "0")
+        library.cache_clear()
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(threads)
+            library.cache_clear()
+
+
+def trace(task: str, method: str, seed: int, steps: int, taken: np.ndarray | None = None) -> np.ndarray:
+    """Actions [T, A] of the first `steps` steps of an episode, alone in its batch, rounded.
+
+    The environment is stepped by the actions `taken` where they are given, else by the method's own rounded ones: a
+    difference in the last digits does then not grow through the environment.
+    """
+    model, config, _ = load_checkpoint(released(task))
+    env = make_env(TASKS[task].env_id)
+    try:
+        agent = make_agent(method, model, config, env.action_space, _random_head(method, config, model.action_dim))
+        read = FrameReader(env, model.spaces.height)
+        observation, _ = env.reset(seed=seed, options={"split": "test"})
+        agent.reset(np.ones(1, bool), np.array([seed]))
+        frames = [read(observation)] * agent.frame_stack
+        actions = []
+        for step in range(steps if taken is None else len(taken)):
+            action = np.round(agent.act(np.stack(frames[-agent.frame_stack :])[None])[0].astype(np.float64), DECIMALS)
+            actions.append(action)
+            sent = action if taken is None else taken[step]
+            observation, _, terminated, truncated, info = env.step(sent.astype(np.float32))
+            frames.append(read(observation))
+            if terminated or truncated or info.get("success"):
+                break
+        return np.stack(actions)
+    finally:
+        env.close()
+
+
+def _random_head(method: str, config: Config, action_dim: int) -> Any:
+    if method not in HEADS:
+        return None
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(HEAD_SEEDS[method])
+        head = make_head(method, config.model, action_dim)
+    if isinstance(head, SubgoalHead):
+        head.steps_ahead.fill_(HORIZONS[method])
+    return head.requires_grad_(False)
+
+
+# Losses.
+
+TINY = ModelConfig(
+    frame_stack=2, latent_dim=4, encoder_filters=(4, 4), encoder_kernels=(4, 4), encoder_strides=(2, 2), encoder_dense=(8,),
+    dynamics_dense=(16,), generative_dense=(16,), noise_dim=2, policy_dense=(16,), critic_dense=(16,), bank_size=10)
+BRIEF = TrainConfig(
+    joint_steps=2, latent_steps=0, batch_windows=6, window=5, latent_batch=8, latent_horizon=3, latent_value_batch=16,
+    latent_dynamics_batch=16, encoder_pairs=8, encoder_reach=4, value_transitions=12, dynamics_rollouts=10,
+    precision="float32", holdout_episodes=1)
+LATE: dict[str, Any] = {
+    "latent_steps": 2, "latent_dynamics_steps": 2, "latent_value_steps": 2, "member_steps": 2, "members": 3,
+    "distil_steps": 2, "held_steps": 2, "held_actions": 3, "held_members": 2, "clone_steps": 2, "clone_reach": 3}
+OWN: dict[str, Any] = {"success_policy": True, "held_policy": True}
+BEST: dict[str, Any] = {"critic_loss": "cross_entropy", "critic_floor": 0.02, "policy_relative": True}
+TEACHERS: dict[str, Any] = {"member_steps": 2, "members": 3, "distil_steps": UPDATES}
+HOLDERS: dict[str, Any] = {"held_steps": 2, "held_actions": 3, "held_members": 2, "distil_steps": UPDATES}
+
+PHASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    "encoder-pairs": ("encoder", {}, {"encoder_steps": UPDATES, "encoder_rewarded_share": 0.3}),
+    "encoder-moments": ("encoder", {"moment_colours": 4, "slow_features": 2, "latent_dim": 8}, {"encoder_steps": UPDATES}),
+    "joint-infonce": ("joint", {}, {"joint_steps": UPDATES}),
+    "joint-mse": ("joint", {}, {"joint_steps": UPDATES, "dynamics_loss": "mse"}),
+    "joint-paper": ("joint", {"norm": "batch", "dynamics_residual": False, "critic_bounded": False, "n_global": 1},
+                    {"joint_steps": UPDATES, "whole_windows": False, "window": 3, "value_transitions": 0,
+                     "dynamics_rollouts": 0, "rewarded_share": 0.0, "target_rate": 0.005, "policy_every": 1}),
+    "joint-many-scenes": ("joint", {"latent_norm": True}, {
+        "joint_steps": UPDATES, "group_windows": 3, "group_reach": 2, "reconstruction": 0.05, "reconstruction_side": 8,
+        "shift": 2, "anneal": True, **BEST}),
+    "joint-commands": ("joint", {"command_memory": 0.8, "command_dims": 2}, {"joint_steps": UPDATES}),
+    "latent": ("latent", {}, {"latent_steps": UPDATES, **BEST}),
+    "latent-kept-moments": (
+        "latent", {"moment_colours": 4, "slow_features": 2, "latent_dim": 32, "keep_moments": True},
+        {"encoder_steps": 2, "latent_steps": UPDATES}),
+    "latent-rewarded": ("latent", {}, {"latent_steps": UPDATES, "latent_rewarded_share": 0.3}),
+    "latent-dynamics-alone": ("latent", {}, {"latent_steps": UPDATES, "latent_heads": False}),
+    "latent-heads-afresh": ("latent", {"command_memory": 0.8}, {"latent_steps": UPDATES, "heads_afresh": True}),
+    "dynamics": ("dynamics", {}, {"latent_dynamics_steps": UPDATES}),
+    "dynamics-uniform": ("dynamics", {}, {"latent_dynamics_steps": UPDATES, "latent_priority": 0.0}),
+    "values": ("values", {}, {"latent_value_steps": UPDATES, "latent_rewarded_share": 0.2, **BEST}),
+    "members": ("members", {}, {**TEACHERS, "member_steps": UPDATES, "member_noise": 0.1}),
+    "members-cross-entropy": ("members", {}, {**TEACHERS, "member_steps": UPDATES, **BEST}),
+    "distil": ("distil", {}, TEACHERS),
+    "held": ("held", OWN, {**HOLDERS, "held_steps": UPDATES}),
+    "held_distil": ("held_distil", OWN, HOLDERS),
+    "clone": ("clone", OWN, {"clone_steps": UPDATES}),
+    "clone-candidates": ("clone", OWN, {"clone_steps": UPDATES, "clone_candidates": 2, "clone_reach": 3}),
+    "clone-after-everything": ("clone", OWN, {"encoder_steps": 2, **LATE, "clone_steps": UPDATES}),
+}
+"""Cases of the joint training: the phase whose updates are recorded, and the fields of the model and of the training that
+differ from `TINY` and `BRIEF`."""
+
+
+def tiny_store(side: int = 16, actions: int = 3, episodes: int = 12, length: int = 8) -> FrameStore:
+    """Episodes of a bright square that the actions move over noise; every third one ends in a success."""
+    rng = np.random.default_rng(5)
+    rows = episodes * (length + 1)
+    frames = rng.integers(0, 60, (rows, side, side, 3), dtype=np.uint8)
+    given = rng.uniform(-1, 1, (rows, actions)).astype(np.float32)
+    given[length :: length + 1] = 0
+    size = side // 4
+    for episode in range(episodes):
+        place = rng.uniform(size, side - 2 * size, 2)
+        for row in range(episode * (length + 1), (episode + 1) * (length + 1)):
+            y, x = place.astype(int)
+            frames[row, y : y + size, x : x + size] = (220, 180, 40 + 10 * (episode % 3))
+            place = np.clip(place + given[row, :2] * size / 2, 0, side - size)
+    rewards, terminated, truncated = np.zeros(rows, np.float32), np.zeros(rows, bool), np.zeros(rows, bool)
+    ends = np.arange(length - 1, rows, length + 1)
+    rewards[ends[::3]] = 1
+    terminated[ends[::3]] = True
+    truncated[ends] = ~terminated[ends]
+    return FrameStore(
+        frames=frames, actions=given, rewards=rewards, terminated=terminated, truncated=truncated,
+        episode_start=np.arange(episodes) * (length + 1), episode_length=np.full(episodes, length),
+        action_low=np.full(actions, -1, np.float32), action_high=np.full(actions, 1, np.float32),
+        dataset_id="test/golden-v0", content_hash="golden")
+
+
+def phase_losses(case: str, folder: Path) -> list[dict[str, float]]:
+    """What each of the `UPDATES` updates of a case of `PHASES` says."""
+    phase, model, training = PHASES[case]
+    config = override(Config("test", "default", model=TINY, train=BRIEF), model=model, train=training)
+    run = Trainer(config, tiny_store(), folder, 0, torch.device("cpu"))
+    seen = []
+    while run.step < run.total:
+        info = run.update()
+        if run.phase == phase:
+            seen.append(_plain(info))
+    assert len(seen) == UPDATES, f"{case} had {len(seen)} updates of {phase}"
+    return seen
+
+
+def head_losses(method: str, folder: Path) -> list[dict[str, float]]:
+    """What each of the first `UPDATES` updates of a method's learner says, and last its held-out losses."""
+    config = Config("test", "default", model=TINY, train=BRIEF)
+    run = Trainer(config, tiny_store(), folder, 0, torch.device("cpu"))
+    run.model.eval()
+    folder.mkdir(parents=True, exist_ok=True)
+    data = latent_data(run.model, config, {"seed": "0"}, tiny_store(), folder)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(HEAD_SEEDS[method])
+        head = make_head(method, config.model, run.model.action_dim).train()
+    settings = learner_config(method, "default", {"batch": 16, "steps": 200})
+    learner = RECIPES[method].learner(head, data, settings, make_generator(HEAD_SEEDS[method], stream=3))
+    return [_plain(learner.update()) for _ in range(UPDATES)] + [learner.report()]
+
+
+def _plain(info: dict[str, Tensor]) -> dict[str, float]:
+    return {name: float(value) for name, value in info.items()}
+
+
+# Released checkpoints.
+
+
+def checkpoint_facts(task: str) -> dict[str, Any]:
+    """What a released checkpoint is, as it is loaded: hashes, the whole config, provenance that decides records."""
+    model, config, metadata = load_checkpoint(released(task))
+    return {
+        "config_hash": config.hash(),
+        "method_hashes": {name: method_hash(config, name) for name in ALL_METHODS if name not in HEADED},
+        "weights_sha256": metadata["weights_sha256"],
+        "shared_sha256": shared_weights(metadata),
+        "tensors_sha256": tensors_digest(released(task)),
+        "parameters": sum(value.numel() for value in model.state_dict().values()),
+        "format": metadata["format"],
+        "seed": int(metadata["seed"]),
+        "steps": int(metadata["steps"]),
+        "dataset_id": metadata["dataset_id"],
+        "dataset_hash": metadata["dataset_hash"],
+        "spaces": json.loads(metadata["spaces"]),
+        "config": config_fields(config),
+    }
+
+
+def hashes_of_content(task: str) -> tuple[str, str]:
+    """`weights_sha256` computed anew from the file's tensors and config, and what its metadata says."""
+    tensors, metadata = load_tensors(released(task))
+    return content_sha256(tensors, {"config": Config.from_json(metadata["config"]).to_json()}), metadata["weights_sha256"]
+
+
+def tensors_digest(path: Path) -> str:
+    """SHA-256 over the values of all tensors of a file, whatever their names and order."""
+    tensors, _ = load_tensors(path)
+    single = sorted(hashlib.sha256(f"{tuple(value.shape)}".encode() + value.double().numpy().tobytes()).hexdigest()
+                    for value in tensors.values())
+    return hashlib.sha256("".join(single).encode()).hexdigest()
+
+
+def todays_config(task: str) -> dict[str, Any]:
+    """All fields of the default preset of a task."""
+    return config_fields(make_config(task, "default"))
+
+
+def config_fields(config: Config) -> dict[str, Any]:
+    """Every field of a config with its value, those at their defaults too."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def record_identities(task: str, method: str) -> set[tuple[str, str]]:
+    """(config hash, checkpoint hash) in the committed records of a method."""
+    path = record_path(REPOSITORY / "results/records", task, method, "default", 0)
+    return {(record.config_hash, record.checkpoint) for record in read_records(path)}
+
+
+# Files of the old layout.
+
+OLD_TASK = "SpiralMaze"
+OLD_STOP = 16
+"""Updates of the unfinished run: every phase has one before, some have one after."""
+
+
+def old_config() -> Config:
+    """A tiny run of the task `OLD_TASK` with most phases."""
+    model = {**dataclasses.asdict(TINY), **OWN, "encoder_strides": (4, 2)}
+    training = {**dataclasses.asdict(BRIEF), **LATE, "joint_steps": 4, "clone_steps": 4, "reconstruction": 0.0,
+                "checkpoint_every": 8, "log_every": 2}
+    planner = {"n_iter": 8, "candidates": 4, "n_sim": 2}
+    return override(make_config(OLD_TASK), model=model, train=training, planner=planner)
+
+
+def old_store() -> FrameStore:
+    """The data of that run."""
+    return tiny_store(side=64, actions=2)
+
+
+def train_old(folder: Path, stop: int | None = None, resume: bool = False) -> Path:
+    """Train that run, to `stop` updates as Ctrl-C would or to its end; returns its folder."""
+
+    def interrupt(progress: Any) -> None:
+        if stop is not None and progress.step >= stop:
+            signal.raise_signal(signal.SIGINT)
+
+    with contextlib.nullcontext() if stop is None else pytest.raises(KeyboardInterrupt):
+        train(old_config(), old_store(), folder, device="cpu", resume=resume, command="velap train SpiralMaze",
+              on_progress=interrupt)
+    return folder
+
+
+def finish_old(folder: Path) -> Path:
+    """Go on with an unfinished copy of it; returns the finished checkpoint."""
+    return train_old(folder, resume=True) / MODEL
+
+
+def old_state(folder: Path) -> Path:
+    """The state file of a run directory."""
+    return folder / STATE
+
+
+def read_tensors(path: Path) -> dict[str, np.ndarray]:
+    """The tensors of any of velap's files by name, checksum verified."""
+    return {name: value.numpy() for name, value in load_tensors(path)[0].items()}
+
+
+def train_old_head(checkpoint: Path, method: str) -> Path:
+    """Learn a head beside a checkpoint of that run."""
+    settings = learner_config(method, "default", {"batch": 16, "steps": 20})
+    return train_head(method, checkpoint, old_store(), device="cpu", config=settings, command="velap train").path
+
+
+def evaluate_old(checkpoint: Path, records: Path, method: str, episodes: int = 2) -> Path:
+    """Validation episodes of a checkpoint of that run; returns the record file."""
+    api.evaluate(OLD_TASK, checkpoint, method=method, episodes=episodes, first_seed=1000, records=records, device="cpu")
+    return record_path(records, OLD_TASK, method, "default", 0)
+
+
+def load_old(checkpoint: Path, method: str) -> tuple[LatentModel, dict[str, Any]]:
+    """The model and all fields of the config of a finished old checkpoint; a method with a head has that one beside it."""
+    model, config, metadata = load_checkpoint(checkpoint)
+    if method in HEADS:
+        load_head(checkpoint.with_name(f"{method}.safetensors"), metadata)
+    return model, config_fields(config)
+
+
+def read_old_records(path: Path) -> list[dict[str, Any]]:
+    """Fields of the records of a file."""
+    return [dataclasses.asdict(record) for record in read_records(path)]
+
+

@@ -1,0 +1,106 @@
+"""What the code does is what it did when tests/golden was written: traces, losses, released checkpoints, old files."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import golden_access as velap
+
+GOLDEN = Path(__file__).parent / "golden"
+ACTION = 1e-4
+"""Largest difference of an action [environment's action]: processors round differently."""
+LOSS = 1e-3
+"""Largest relative difference of a loss."""
+
+
+def read(name: str) -> dict[str, Any]:
+    return json.loads((GOLDEN / f"{name}.json").read_text())
+
+
+TRACES, LOSSES, CHECKPOINTS = read("traces"), read("losses"), read("checkpoints")
+every_task = pytest.mark.parametrize("task", CHECKPOINTS)
+
+
+@every_task
+def test_every_method_acts_as_before(task: str) -> None:
+    assert set(TRACES[task]) == set(velap.ALL_METHODS)
+    wrong = []
+    with velap.pytorch_networks():
+        for method, seeds in TRACES[task].items():
+            for seed, actions in seeds.items():
+                expected = np.array(actions)
+                found = velap.trace(task, method, int(seed), len(expected), taken=expected)
+                if found.shape != expected.shape:
+                    wrong.append(f"{method}, seed {seed}: {found.shape} instead of {expected.shape}")
+                elif (error := np.abs(found - expected).max(1)).max() > ACTION:
+                    step = int(np.argmax(error > ACTION))
+                    wrong.append(f"{method}, seed {seed}: from step {step} on, at most by {error.max():.3g}")
+    assert wrong == []
+
+
+def test_every_learner_has_its_losses_recorded() -> None:
+    assert set(LOSSES) == set(velap.PHASES) | {f"head-{method}" for method in velap.HEADED}
+
+
+@pytest.mark.parametrize("case", LOSSES)
+def test_losses_are_as_before(case: str, tmp_path: Path) -> None:
+    with velap.pytorch_networks():
+        if case in velap.PHASES:
+            seen, report = velap.phase_losses(case, tmp_path), None
+        else:
+            *seen, report = velap.head_losses(case.removeprefix("head-"), tmp_path)
+    for update, expected in LOSSES[case].items():
+        found = report if update == "report" else seen[int(update) - 1]
+        assert found == pytest.approx(expected, rel=LOSS, abs=1e-5), f"update {update}"
+
+
+@every_task
+def test_released_checkpoints_are_what_they_were(task: str) -> None:
+    assert velap.checkpoint_facts(task) == CHECKPOINTS[task]
+
+
+@every_task
+def test_the_config_of_a_released_checkpoint_is_todays(task: str) -> None:
+    assert velap.todays_config(task) == CHECKPOINTS[task]["config"]
+
+
+@every_task
+def test_the_weights_hash_is_of_the_weights(task: str) -> None:
+    computed, written = velap.hashes_of_content(task)
+    assert computed == written == CHECKPOINTS[task]["weights_sha256"]
+
+
+@every_task
+def test_committed_records_are_those_of_the_released_checkpoint(task: str) -> None:
+    facts = CHECKPOINTS[task]
+    hashes = {"velap": facts["weights_sha256"], "random": ""}
+    for method, config_hash in facts["method_hashes"].items():
+        expected = (config_hash, hashes.get(method, facts["shared_sha256"]))
+        assert velap.record_identities(task, method) == {expected}, method
+
+
+def test_an_old_unfinished_run_goes_on_to_the_weights_of_the_finished_one(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(GOLDEN / "old/unfinished", run)
+    with velap.pytorch_networks():
+        found = velap.read_tensors(velap.finish_old(run))
+    expected = velap.read_tensors(GOLDEN / "old/finished/model.safetensors")
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-3, atol=1e-4, err_msg=name)
+
+
+def test_an_old_finished_run_is_read_with_its_head_and_records() -> None:
+    old = GOLDEN / "old"
+    for method in ("velap", "bc"):
+        model, config = velap.load_old(old / "finished/model.safetensors", method)
+        assert sum(value.numel() for value in model.state_dict().values()) > 1000
+        assert config == velap.config_fields(velap.old_config())
+        records = velap.read_old_records(old / f"records/SpiralMaze/{method}-default/train0.jsonl")
+        assert [(record["method"], record["episode_seed"]) for record in records] == [(method, 1000), (method, 1001)]
