@@ -20,18 +20,18 @@ import torch
 from torch import Tensor
 
 from velap import api
-from velap.agents.base import METHODS, make_agent, method_hash
-from velap.bench.evaluate import make_env
-from velap.bench.records import read_records, record_path
-from velap.bench.rollout import FrameReader
 from velap.config import Config, ModelConfig, override
-from velap.data.episodes import FrameStore
+from velap.config.training import TrainConfig
+from velap.data.frames import FrameStore
+from velap.evaluation.evaluate import make_env
+from velap.evaluation.records import read_records, record_path
+from velap.evaluation.rollout import FrameReader
+from velap.methods.base import METHODS, make_agent, method_hash, method_settings
 from velap.models.heads import HEADS, SubgoalHead, load_head, make_head
-from velap.models.latent import LatentModel, load_checkpoint, shared_weights
-from velap.models.native import library
+from velap.models.velap import LatentModel, load_checkpoint, shared_weights
+from velap.native.kernels import library
 from velap.runs import content_sha256, load_tensors, make_generator
 from velap.tasks import TASKS, make_config
-from velap.train_config import TrainConfig
 from velap.training.frozen import latent_data
 from velap.training.heads import RECIPES, learner_config, train_head
 from velap.training.loop import MODEL, STATE, Trainer, train
@@ -44,6 +44,8 @@ HEAD_SEEDS = {"bc": 7, "bc-success": 8, "iql": 9, "iql-sparse": 10, "iris": 11, 
 """Seeds of the random weights of the heads in the traces, and of their learners."""
 HORIZONS = {"iris": 10, "iris-multistep": 5}
 """Steps to a subgoal in those heads."""
+SHOOTING = {"arithmetic": "float32", "samples": 200}
+"""How MPPI and MBOP plan in the traces, besides their defaults: fewer trajectories take less time."""
 UPDATES = 20
 """Recorded updates of a phase."""
 DECIMALS = 6
@@ -77,12 +79,17 @@ def trace(task: str, method: str, seed: int, steps: int, taken: np.ndarray | Non
     """Actions [T, A] of the first `steps` steps of an episode, alone in its batch, rounded.
 
     The environment is stepped by the actions `taken` where they are given, else by the method's own rounded ones: a
-    difference in the last digits does then not grow through the environment.
+    difference in the last digits does then not grow through the environment. Encoder and shooting compute in single
+    precision: half precision rounds by processor and batch, which moves elites.
     """
     model, config, _ = load_checkpoint(released(task))
+    if hasattr(model.encoder, "dtype"):
+        model.encoder.dtype = torch.float32
+    settings = method_settings(method, SHOOTING if method in ("mppi", "mbop") else None)
     env = make_env(TASKS[task].env_id)
     try:
-        agent = make_agent(method, model, config, env.action_space, _random_head(method, config, model.action_dim))
+        head = _random_head(method, config, model.action_dim)
+        agent = make_agent(method, model, config, env.action_space, head, settings)
         read = FrameReader(env, model.spaces.height)
         observation, _ = env.reset(seed=seed, options={"split": "test"})
         agent.reset(np.ones(1, bool), np.array([seed]))
