@@ -23,6 +23,7 @@ from velap import api
 from velap.config import Config, ModelConfig, override
 from velap.config.training import TrainConfig
 from velap.data.frames import FrameStore
+from velap.errors import CheckpointError
 from velap.evaluation.evaluate import make_env
 from velap.evaluation.records import read_records, record_path
 from velap.evaluation.rollout import FrameReader
@@ -125,38 +126,34 @@ TINY = ModelConfig(
     frame_stack=2, latent_dim=4, encoder_filters=(4, 4), encoder_kernels=(4, 4), encoder_strides=(2, 2), encoder_dense=(8,),
     dynamics_dense=(16,), generative_dense=(16,), noise_dim=2, policy_dense=(16,), critic_dense=(16,), bank_size=10)
 BRIEF = TrainConfig(
-    joint_steps=2, latent_steps=0, batch_windows=6, window=5, latent_batch=8, latent_horizon=3, latent_value_batch=16,
-    latent_dynamics_batch=16, encoder_pairs=8, encoder_reach=4, value_transitions=12, dynamics_rollouts=10,
-    precision="float32", holdout_episodes=1)
+    joint_steps=2, latent_steps=0, batch_windows=6, window=5, latent_horizon=3, encoder_pairs=8, value_transitions=12,
+    dynamics_rollouts=10, precision="float32", holdout_episodes=1)
 LATE: dict[str, Any] = {
-    "latent_steps": 2, "latent_dynamics_steps": 2, "latent_value_steps": 2, "member_steps": 2, "members": 3,
-    "distil_steps": 2, "held_steps": 2, "held_actions": 3, "held_members": 2, "clone_steps": 2, "clone_reach": 3}
+    "latent_steps": 2, "latent_value_steps": 2, "member_steps": 2, "members": 3, "distil_steps": 2, "held_steps": 2,
+    "clone_steps": 2, "clone_reach": 3}
 OWN: dict[str, Any] = {"success_policy": True, "held_policy": True}
 BEST: dict[str, Any] = {"critic_loss": "cross_entropy", "critic_floor": 0.02, "policy_relative": True}
 TEACHERS: dict[str, Any] = {"member_steps": 2, "members": 3, "distil_steps": UPDATES}
-HOLDERS: dict[str, Any] = {"held_steps": 2, "held_actions": 3, "held_members": 2, "distil_steps": UPDATES}
+HOLDERS: dict[str, Any] = {"held_steps": 2, "distil_steps": UPDATES}
 
 PHASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
-    "encoder-pairs": ("encoder", {}, {"encoder_steps": UPDATES, "encoder_rewarded_share": 0.3}),
+    "encoder-pairs": ("encoder", {}, {"encoder_steps": UPDATES}),
     "encoder-moments": ("encoder", {"moment_colours": 4, "slow_features": 2, "latent_dim": 8}, {"encoder_steps": UPDATES}),
     "joint-infonce": ("joint", {}, {"joint_steps": UPDATES}),
     "joint-mse": ("joint", {}, {"joint_steps": UPDATES, "dynamics_loss": "mse"}),
     "joint-paper": ("joint", {"norm": "batch", "dynamics_residual": False, "critic_bounded": False, "n_global": 1},
                     {"joint_steps": UPDATES, "whole_windows": False, "window": 3, "value_transitions": 0,
                      "dynamics_rollouts": 0, "rewarded_share": 0.0, "target_rate": 0.005, "policy_every": 1}),
-    "joint-many-scenes": ("joint", {"latent_norm": True}, {
+    "joint-many-scenes": ("joint", {}, {
         "joint_steps": UPDATES, "group_windows": 3, "group_reach": 2, "reconstruction": 0.05, "reconstruction_side": 8,
-        "shift": 2, "anneal": True, **BEST}),
+        **BEST}),
     "joint-commands": ("joint", {"command_memory": 0.8, "command_dims": 2}, {"joint_steps": UPDATES}),
     "latent": ("latent", {}, {"latent_steps": UPDATES, **BEST}),
     "latent-kept-moments": (
         "latent", {"moment_colours": 4, "slow_features": 2, "latent_dim": 32, "keep_moments": True},
         {"encoder_steps": 2, "latent_steps": UPDATES}),
     "latent-rewarded": ("latent", {}, {"latent_steps": UPDATES, "latent_rewarded_share": 0.3}),
-    "latent-dynamics-alone": ("latent", {}, {"latent_steps": UPDATES, "latent_heads": False}),
     "latent-heads-afresh": ("latent", {"command_memory": 0.8}, {"latent_steps": UPDATES, "heads_afresh": True}),
-    "dynamics": ("dynamics", {}, {"latent_dynamics_steps": UPDATES}),
-    "dynamics-uniform": ("dynamics", {}, {"latent_dynamics_steps": UPDATES, "latent_priority": 0.0}),
     "values": ("values", {}, {"latent_value_steps": UPDATES, "latent_rewarded_share": 0.2, **BEST}),
     "members": ("members", {}, {**TEACHERS, "member_steps": UPDATES, "member_noise": 0.1}),
     "members-cross-entropy": ("members", {}, {**TEACHERS, "member_steps": UPDATES, **BEST}),
@@ -272,9 +269,25 @@ def todays_config(task: str) -> dict[str, Any]:
     return config_fields(make_config(task, "default"))
 
 
+FORMER: dict[str, dict[str, Any]] = {
+    "model": {"latent_norm": False, "command_scale": 2.0},
+    "train": {"encoder_reach": 20, "encoder_rewarded_share": 0.0, "anneal": False, "shift": 0, "group_goals": 0.5,
+              "latent_batch": 256, "latent_dynamics_steps": 0, "latent_dynamics_batch": 512, "latent_dynamics_horizon": 3,
+              "latent_priority": 0.5, "latent_ridge": 0.1, "latent_value_batch": 512, "held_actions": 5, "held_members": 3,
+              "latent_heads": True},
+    "planner": {"max_neighbours": 16, "rehearsals": 0, "rehearsal_paths": 24, "rehearsal_noise": 0.4, "anchor_factor": 1.0},
+    "controller": {"lookahead_samples": 32},
+}
+"""Fields that have gone since, with the value that the code now acts by; every released checkpoint had exactly these."""
+
+
 def config_fields(config: Config) -> dict[str, Any]:
-    """Every field of a config with its value, those at their defaults too."""
-    return json.loads(json.dumps(dataclasses.asdict(config)))
+    """Every field of a config by its name in the golden files, those at their defaults and those of `FORMER` too."""
+    fields = json.loads(json.dumps(dataclasses.asdict(config)))
+    for part, gone in FORMER.items():
+        assert not gone.keys() & fields[part].keys(), f"some of FORMER's {sorted(gone)} are fields of {part}"
+        fields[part] |= gone
+    return fields
 
 
 def record_identities(task: str, method: str) -> set[tuple[str, str]]:
@@ -286,7 +299,7 @@ def record_identities(task: str, method: str) -> set[tuple[str, str]]:
 # Files of the old layout.
 
 OLD_TASK = "SpiralMaze"
-OLD_STOP = 16
+OLD_STOP = 14
 """Updates of the unfinished run: every phase has one before, some have one after."""
 
 
@@ -302,6 +315,13 @@ def old_config() -> Config:
 def old_store() -> FrameStore:
     """The data of that run."""
     return tiny_store(side=64, actions=2)
+
+
+def refusal_of_old(folder: Path) -> str:
+    """What a resume of an unfinished copy of it says where the run is refused."""
+    with pytest.raises(CheckpointError) as refused:
+        finish_old(folder)
+    return str(refused.value)
 
 
 def train_old(folder: Path, stop: int | None = None, resume: bool = False) -> Path:

@@ -85,15 +85,21 @@ def test_committed_records_are_those_of_the_released_checkpoint(task: str) -> No
         assert velap.record_identities(task, method) == {expected}, method
 
 
-def test_an_old_unfinished_run_goes_on_to_the_weights_of_the_finished_one(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(GOLDEN / "old/unfinished", run)
+def test_a_run_of_several_phases_comes_to_the_weights_that_it_came_to(tmp_path: Path) -> None:
     with velap.pytorch_networks():
-        found = velap.read_tensors(velap.finish_old(run))
+        found = velap.read_tensors(velap.train_old(tmp_path) / "model.safetensors")
     expected = velap.read_tensors(GOLDEN / "old/finished/model.safetensors")
     assert found.keys() == expected.keys()
     for name, values in expected.items():
         np.testing.assert_allclose(found[name], values, rtol=1e-3, atol=1e-4, err_msg=name)
+
+
+def test_an_old_unfinished_run_is_refused_with_a_way_out_and_left_alone(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(GOLDEN / "old/unfinished", run)
+    assert "start a new run elsewhere with --out" in velap.refusal_of_old(run)
+    for path in (GOLDEN / "old/unfinished").iterdir():
+        assert (run / path.name).read_bytes() == path.read_bytes(), path.name
 
 
 def test_an_old_finished_run_is_read_with_its_head_and_records() -> None:
