@@ -35,6 +35,7 @@ from velap.search.est import plan
 from velap.search.shooting import MPPIConfig, shoot
 from velap.search.types import SearchFns
 from velap.tasks import get_task, make_config
+from velap.training.joint import windows_of
 from velap.training.loop import Trainer, keep_freed_memory, train
 
 TASK = "SpiralMaze"
@@ -152,7 +153,7 @@ def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
         settings = override(make_config(TASK), model={"frame_stack": frame_stack})
         trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
         config, encoder = trainer.config.train, trainer.model.encoder
-        batch = trainer.sampler.sample(config.batch_windows, config.window, config.whole_windows, trainer.generator)
+        batch = trainer.sampler.sample(windows_of(config), trainer.generator)
         stacks = trainer.sampler.stacks(batch.rows)
         updates = 4 * config.policy_every
 
