@@ -28,14 +28,13 @@ from velap.config import ModelConfig, override
 from velap.config.planning import PlannerConfig
 from velap.data.frames import FrameStore, load_store, make_store, write_dataset
 from velap.errors import CheckpointError, VelapError
+from velap.methods.mppi import MPPIConfig, shoot
 from velap.models.velap import LatentModel, Spaces, load_checkpoint
 from velap.report.demo import released_checkpoint
 from velap.runs import make_generator
 from velap.search.est import plan
-from velap.search.shooting import MPPIConfig, shoot
 from velap.search.types import SearchFns
 from velap.tasks import get_task, make_config
-from velap.training.joint import windows_of
 from velap.training.loop import Trainer, keep_freed_memory, train
 
 TASK = "SpiralMaze"
@@ -153,7 +152,7 @@ def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
         settings = override(make_config(TASK), model={"frame_stack": frame_stack})
         trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
         config, encoder = trainer.config.train, trainer.model.encoder
-        batch = trainer.sampler.sample(windows_of(config), trainer.generator)
+        batch = trainer.sampler.sample(config.batch_windows, config.window, config.whole_windows, trainer.generator)
         stacks = trainer.sampler.stacks(batch.rows)
         updates = 4 * config.policy_every
 

@@ -19,12 +19,11 @@ from velap.data import minari_io
 from velap.data.behaviours import mixture
 from velap.errors import ConfigError, RecordError
 from velap.evaluation.records import Record, read_records, record_path
-from velap.methods.base import method_hash
-from velap.models.heads import HEADS, head_path
+from velap.methods.base import get_method
+from velap.methods.heads import head_path
 from velap.models.velap import WEIGHTS_SHA256, shared_weights
 from velap.storage import run_dir
 from velap.tasks import Recipe, get_task, make_config
-from velap.training.heads import learner_config
 from velap.training.loop import MODEL
 
 Kind = Literal["dataset", "joint", "head", "evaluate"]
@@ -129,11 +128,12 @@ class Inventory:
     def expected_hash(self, cell: Cell) -> str | None:
         """The `config_hash` that an evaluation of the cell writes today; None where its head is not known."""
         config = make_config(cell.task, cell.preset)
-        if cell.method not in HEADS:
-            return method_hash(config, cell.method)
+        method = get_method(cell.method)
+        if not method.learns:
+            return method.config_hash(config)
         metadata, timing = checkpoint_metadata(self.head_path(cell)), self.timings.get(job_name("head", cell))
         weights = metadata[WEIGHTS_SHA256] if metadata is not None else timing.identity if timing is not None else None
-        return None if weights is None else method_hash(config, cell.method, _Head(head_settings(cell), weights))
+        return None if weights is None else method.config_hash(config, _Head(head_settings(cell), weights))
 
     def head_path(self, cell: Cell) -> Path:
         """Where the head of a cell lies."""
@@ -167,7 +167,7 @@ class Inventory:
 
 @dataclass
 class _Head:
-    """What `method_hash` asks of a head."""
+    """What `Method.config_hash` asks of a head."""
 
     settings: str
     weights_sha256: str
@@ -187,7 +187,7 @@ def checkpoint_path(task: str, preset: str, seed: int) -> Path:
 
 def head_settings(cell: Cell) -> str:
     """The settings that the cell's head is trained with today."""
-    return learner_config(cell.method, cell.preset).to_json()
+    return get_method(cell.method).learner_config(cell.preset).to_json()
 
 
 def released_checkpoint(task: str, preset: str, seed: int) -> Path | None:
@@ -273,7 +273,7 @@ def _expected_updates(cell: Cell) -> int:
     transitions = recipe.transitions
     if cell.method == "bc-success":
         transitions = round(transitions * recipe.success_percent / 100 * recipe.max_steps / 2)
-    return learner_config(cell.method, cell.preset).length(transitions)
+    return get_method(cell.method).learner_config(cell.preset).length(transitions)
 
 
 def _recipe_defaults() -> dict[str, Any]:

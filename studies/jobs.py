@@ -9,7 +9,7 @@ from typing import get_args
 
 from studies.inventory import Finding, Inventory, Kind, checkpoint_path, job_name
 from studies.matrix import Cell
-from velap.models.heads import HEADS
+from velap.methods.base import get_method
 
 RECORDS = Path("results/records")
 """Default root of the records; commands do not name it."""
@@ -58,7 +58,7 @@ def make_plan(cells: Sequence[Cell], inventory: Inventory, options: Options) -> 
 def _jobs_of(cell: Cell, inventory: Inventory, options: Options) -> Iterable[Job]:
     """The chain of one cell."""
     kinds: list[Kind] = ["dataset", "joint"] if cell.method != "random" else []
-    if cell.method in HEADS:
+    if get_method(cell.method).learns:
         kinds.append("head")
     needs: tuple[str, ...] = ()
     for kind in (*kinds, "evaluate"):

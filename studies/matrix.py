@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from studies.paper import LABELS
 from studies.paper import TASKS as PAPER_TASKS
 from velap.errors import ConfigError, UnknownTaskError
-from velap.methods.base import METHODS
+from velap.registry import METHODS
 from velap.tasks import PRESETS, TASKS
 
 AXES = ("task", "method", "preset", "seed")

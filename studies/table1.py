@@ -15,7 +15,7 @@ from velap.errors import RecordError
 from velap.evaluation.records import Record, read_records, select
 from velap.evaluation.statistics import Episodes, Paired, mcnemar, mean_and_spread
 from velap.evaluation.summary import Summary, summarise
-from velap.models.heads import HEADS
+from velap.methods.base import get_method
 from velap.models.velap import WEIGHTS_SHA256, shared_weights
 from velap.tasks import PRESETS
 from velap.tasks import TASKS as REGISTERED
@@ -146,7 +146,8 @@ def _run(cell: Cell, path: Path, inventory: Inventory, timings: Timings) -> Run:
 
 def _training_seconds(cell: Cell, timings: Timings) -> float | None:
     """Joint training and head of the cell, where all of it is known [s]."""
-    kinds: tuple[Kind, ...] = () if cell.method == "random" else ("joint", "head") if cell.method in HEADS else ("joint",)
+    method = get_method(cell.method)
+    kinds: tuple[Kind, ...] = () if not method.needs_model else ("joint", "head") if method.learns else ("joint",)
     names = [job_name(kind, cell) for kind in kinds]
     found = [timings.get(name) for name in names]
     known = [timing.seconds for timing in found if timing is not None]

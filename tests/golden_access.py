@@ -27,20 +27,22 @@ from velap.errors import CheckpointError
 from velap.evaluation.evaluate import make_env
 from velap.evaluation.records import read_records, record_path
 from velap.evaluation.rollout import FrameReader
-from velap.methods.base import METHODS, make_agent, method_hash, method_settings
-from velap.models.heads import HEADS, SubgoalHead, load_head, make_head
+from velap.methods.base import get_method, learning_methods, make_agent
+from velap.methods.heads import load_head, make_head
+from velap.methods.iris import SubgoalHead
+from velap.methods.learning import train_head
 from velap.models.velap import LatentModel, load_checkpoint, shared_weights
 from velap.native.kernels import library
+from velap.registry import METHODS
 from velap.runs import content_sha256, load_tensors, make_generator
 from velap.tasks import TASKS, make_config
 from velap.training.frozen import latent_data
-from velap.training.heads import RECIPES, learner_config, train_head
 from velap.training.loop import MODEL, STATE, Trainer, train
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-HEADED = tuple(HEADS)
+HEADED = tuple(learning_methods())
 """Methods that act by a head of their own."""
-ALL_METHODS = METHODS
+ALL_METHODS = tuple(METHODS)
 HEAD_SEEDS = {"bc": 7, "bc-success": 8, "iql": 9, "iql-sparse": 10, "iris": 11, "iris-multistep": 12}
 """Seeds of the random weights of the heads in the traces, and of their learners."""
 HORIZONS = {"iris": 10, "iris-multistep": 5}
@@ -86,7 +88,7 @@ def trace(task: str, method: str, seed: int, steps: int, taken: np.ndarray | Non
     model, config, _ = load_checkpoint(released(task))
     if hasattr(model.encoder, "dtype"):
         model.encoder.dtype = torch.float32
-    settings = method_settings(method, SHOOTING if method in ("mppi", "mbop") else None)
+    settings = get_method(method).settings_of("default", SHOOTING if method in ("mppi", "mbop") else None)
     env = make_env(TASKS[task].env_id)
     try:
         head = _random_head(method, config, model.action_dim)
@@ -110,7 +112,7 @@ def trace(task: str, method: str, seed: int, steps: int, taken: np.ndarray | Non
 
 
 def _random_head(method: str, config: Config, action_dim: int) -> Any:
-    if method not in HEADS:
+    if method not in HEADED:
         return None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(HEAD_SEEDS[method])
@@ -218,8 +220,8 @@ def head_losses(method: str, folder: Path) -> list[dict[str, float]]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(HEAD_SEEDS[method])
         head = make_head(method, config.model, run.model.action_dim).train()
-    settings = learner_config(method, "default", {"batch": 16, "steps": 200})
-    learner = RECIPES[method].learner(head, data, settings, make_generator(HEAD_SEEDS[method], stream=3))
+    settings = get_method(method).learner_config("default", {"batch": 16, "steps": 200})
+    learner = get_method(method).learner(head, data, settings, make_generator(HEAD_SEEDS[method], stream=3))
     return [_plain(learner.update()) for _ in range(UPDATES)] + [learner.report()]
 
 
@@ -235,7 +237,7 @@ def checkpoint_facts(task: str) -> dict[str, Any]:
     model, config, metadata = load_checkpoint(released(task))
     return {
         "config_hash": config.hash(),
-        "method_hashes": {name: method_hash(config, name) for name in ALL_METHODS if name not in HEADED},
+        "method_hashes": {name: get_method(name).config_hash(config) for name in ALL_METHODS if name not in HEADED},
         "weights_sha256": metadata["weights_sha256"],
         "shared_sha256": shared_weights(metadata),
         "tensors_sha256": tensors_digest(released(task)),
@@ -354,7 +356,7 @@ def read_tensors(path: Path) -> dict[str, np.ndarray]:
 
 def train_old_head(checkpoint: Path, method: str) -> Path:
     """Learn a head beside a checkpoint of that run."""
-    settings = learner_config(method, "default", {"batch": 16, "steps": 20})
+    settings = get_method(method).learner_config("default", {"batch": 16, "steps": 20})
     return train_head(method, checkpoint, old_store(), device="cpu", config=settings, command="velap train").path
 
 
@@ -367,7 +369,7 @@ def evaluate_old(checkpoint: Path, records: Path, method: str, episodes: int = 2
 def load_old(checkpoint: Path, method: str) -> tuple[LatentModel, dict[str, Any]]:
     """The model and all fields of the config of a finished old checkpoint; a method with a head has that one beside it."""
     model, config, metadata = load_checkpoint(checkpoint)
-    if method in HEADS:
+    if method in HEADED:
         load_head(checkpoint.with_name(f"{method}.safetensors"), metadata)
     return model, config_fields(config)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from toy_env import ACTION_SCALE, SIDE, ToyEnv, ToyModel, draw, toy_config
-from toy_world import DISCOUNT, GOAL, SPEED, START, TIP
+from toy_world import GOAL, SPEED, START, TIP
 from velap.config import override
 from velap.errors import ConfigError
 from velap.methods.base import make_agent
@@ -48,7 +48,7 @@ def test_rows_replan_at_their_own_times() -> None:
     for _ in range(3):
         assert planned(agent, START, START) == []
     agent.reset(np.array([False, True]), np.array([0, 3]))
-    assert len(agent.waypoints_ahead(1)) == 0
+    assert len(agent.plans.ahead(1)) == 0
     assert planned(agent, START, START) == [1]
     for _ in range(5):
         assert planned(agent, START, START) == []
@@ -61,18 +61,17 @@ def test_rows_replan_at_their_own_times() -> None:
 def test_near_the_goal_the_global_policy_acts_and_nothing_is_planned() -> None:
     agent = VelapAgent(ToyModel(), toy_config())
     stop = 5.0
-    assert agent._stop_value == pytest.approx(DISCOUNT**stop)
     near, far = (6.0 - stop + 0.2, 0.0), (6.0 - stop - 0.3, 0.0)
     agent.reset(np.ones(2, bool), np.array([0, 1]))
     assert planned(agent, near, far) == [1]
     np.testing.assert_allclose(agent.act(frames_at(near, far))[0], [ACTION_SCALE, 0.0], atol=0.03)
-    assert len(agent.waypoints_ahead(0)) == 0
+    assert len(agent.plans.ahead(0)) == 0
     assert planned(agent, far, far) == [0], "a row that leaves the goal's surroundings without a plan plans at once"
 
 
 def set_plan(agent: VelapAgent, waypoints: list[tuple[float, float]]) -> None:
     """Give row 0 this plan, its root first."""
-    agent._store(torch.tensor([0]), torch.tensor([waypoints], dtype=torch.float64), torch.tensor([len(waypoints)]))
+    agent.plans.store(torch.tensor([0]), torch.tensor([waypoints], dtype=torch.float64), torch.tensor([len(waypoints)]))
 
 
 def test_waypoints_are_passed_when_reached_several_at_once() -> None:
@@ -81,20 +80,20 @@ def test_waypoints_are_passed_when_reached_several_at_once() -> None:
     agent.act(frames_at(START))
     with torch.inference_mode():
         set_plan(agent, [START, (-5.0, 0.0), (-4.0, 0.0), (-4.0, 5.0), (-4.0, 9.0)])
-    assert agent.waypoints_ahead(0)[0].tolist() == [-5.0, 0.0]
+    assert agent.plans.ahead(0)[0].tolist() == [-5.0, 0.0]
 
     action = agent.act(frames_at(START))
     # (-5, 0) is 1 step away and (-4, 0) is 2, both within 3 steps; (-4, 5) is 5.4
-    assert agent.waypoints_ahead(0).tolist() == [[-4.0, 5.0], [-4.0, 9.0]]
+    assert agent.plans.ahead(0).tolist() == [[-4.0, 5.0], [-4.0, 9.0]]
     towards = np.array([2.0, 5.0]) / np.linalg.norm([2.0, 5.0])
     np.testing.assert_allclose(action[0], ACTION_SCALE * towards, atol=0.03)
 
     agent.act(frames_at((-4.0, 1.7)))
-    assert len(agent.waypoints_ahead(0)) == 2, "3.3 steps away: not yet"
+    assert len(agent.plans.ahead(0)) == 2, "3.3 steps away: not yet"
     agent.act(frames_at((-4.0, 2.3)))
-    assert len(agent.waypoints_ahead(0)) == 1
+    assert len(agent.plans.ahead(0)) == 1
     agent.act(frames_at((-4.0, 9.0)))
-    assert agent.waypoints_ahead(0).tolist() == [[-4.0, 9.0]], "the last waypoint stays"
+    assert agent.plans.ahead(0).tolist() == [[-4.0, 9.0]], "the last waypoint stays"
 
 
 def test_a_shortcut_leads_to_the_farthest_waypoint_in_reach() -> None:
@@ -105,9 +104,9 @@ def test_a_shortcut_leads_to_the_farthest_waypoint_in_reach() -> None:
         # from (-6, 0): 9 steps to the first waypoint, 4 to the second, 5 to the third, 7 to the last
         set_plan(agent, [START, (-6.0, 9.0), (-6.0, 4.0), (-1.0, 0.0), (1.0, 0.0)])
     agent.act(frames_at((-6.0, 0.0)))
-    assert agent.waypoints_ahead(0).tolist() == [[-1.0, 0.0], [1.0, 0.0]]
+    assert agent.plans.ahead(0).tolist() == [[-1.0, 0.0], [1.0, 0.0]]
     agent.act(frames_at((-6.0, -9.0)))
-    assert agent.waypoints_ahead(0).tolist() == [[-1.0, 0.0], [1.0, 0.0]], "nothing in reach: no way back either"
+    assert agent.plans.ahead(0).tolist() == [[-1.0, 0.0], [1.0, 0.0]], "nothing in reach: no way back either"
 
 
 @pytest.mark.parametrize(("lookahead", "gets_there"), [(0, False), (3, True)])
@@ -227,7 +226,7 @@ def test_rows_are_led_by_the_policy_of_successes_each_for_itself() -> None:
     agent = VelapAgent(ToyModel(act_success=round_the_wall), config)
     agent.act(frames_at(START, (-1.0, 8.0), (9.0, 9.0)))
     assert agent.planned_rows.tolist() == [0], "too far in the first, near enough in the others"
-    assert agent.led_by_success.tolist() == [False, True, True]
+    assert agent.led.tolist() == [False, True, True]
 
 
 def test_a_model_without_a_policy_of_successes_is_refused() -> None:
@@ -252,7 +251,7 @@ def test_a_row_does_not_depend_on_the_batch_it_is_in() -> None:
     single = alone.act(frames_at(START))
     several = together.act(frames_at((-3.0, -3.0), START, (5.0, 8.0)))
     np.testing.assert_allclose(several[1], single[0], rtol=1e-6)
-    torch.testing.assert_close(together.waypoints_ahead(1), alone.waypoints_ahead(0))
+    torch.testing.assert_close(together.plans.ahead(1), alone.plans.ahead(0))
 
 
 def test_frames_are_encoded_once_a_step() -> None:

@@ -12,15 +12,17 @@ from torch import Tensor
 from toy_env import ACTION_SCALE, ToyEnv, ToyModel, draw
 from toy_world import DISCOUNT, GOAL, START, geodesic, move, roots, unit
 from velap.errors import ConfigError
-from velap.methods import mpc
-from velap.methods.iris import IRISAgent
+from velap.methods import mbop, mppi
+from velap.methods.iris import MULTISTEP_IRIS, IRISAgent, IRISConfig, choose_subgoal
+from velap.methods.mbop import MBOPConfig
 from velap.methods.mpc import MPCAgent
+from velap.methods.mppi import MPPIConfig
 from velap.methods.planning import PlanningAgent
-from velap.search.manager import MULTISTEP, IRISConfig, choose_subgoal
-from velap.search.shooting import MBOPConfig, MPPIConfig, Shot
+from velap.search.shooting import Shot
 
 MPPI = MPPIConfig(samples=120, horizon=12, elites=16, iterations=4)
 MBOP = MBOPConfig(samples=40, horizon=12, elites=8)
+SHOOTERS = {"mppi": (MPPI, mppi.shoot), "mbop": (MBOP, mbop.shoot)}
 AHEAD = (1.0, -4.0)
 """On the goal's side of the wall."""
 
@@ -44,30 +46,29 @@ def solves(agent: PlanningAgent, start: tuple[float, float], limit: int = 45) ->
     return any(env.step(agent.act(frames_at(tuple(env.agent_position())))[0])[2] for _ in range(limit))
 
 
-@pytest.mark.parametrize("planner", [MPPI, MBOP], ids=["mppi", "mbop"])
-def test_shooting_solves_what_its_value_sees_and_stops_at_the_wall(planner: MPPIConfig | MBOPConfig) -> None:
-    assert solves(MPCAgent(ToyModel(), 2, planner), AHEAD)
-    assert not solves(MPCAgent(ToyModel(), 2, planner), START)
+@pytest.mark.parametrize("method", SHOOTERS)
+def test_shooting_solves_what_its_value_sees_and_stops_at_the_wall(method: str) -> None:
+    assert solves(MPCAgent(method, ToyModel(), *SHOOTERS[method]), AHEAD)
+    assert not solves(MPCAgent(method, ToyModel(), *SHOOTERS[method]), START)
 
 
 def test_mppi_finds_a_way_that_its_policy_does_not_know() -> None:
-    assert solves(MPCAgent(ToyModel(value=exact_value, q=lambda z, a: DISCOUNT * exact_value(move(z, a))), 2, MPPI), START)
+    knowing = ToyModel(value=exact_value, q=lambda z, a: DISCOUNT * exact_value(move(z, a)))
+    assert solves(MPCAgent("mppi", knowing, MPPI, mppi.shoot), START)
 
 
-@pytest.mark.parametrize(("planner", "name"), [(MPPI, "shoot"), (MBOP, "shoot_mbop")])
-def test_five_actions_are_executed_and_the_next_plan_starts_from_the_shifted_mean(
-        planner: MPPIConfig | MBOPConfig, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("method", SHOOTERS)
+def test_five_actions_are_executed_and_the_next_plan_starts_from_the_shifted_mean(method: str) -> None:
     shots: list[Shot] = []
     previous: list[Tensor] = []
+    planner, shoot = SHOOTERS[method]
 
     def spy(fns: object, latents: Tensor, cfg: object, generators: object, before: Tensor) -> Shot:
         previous.append(before.clone())
-        shots.append(original(fns, latents, cfg, generators, before))
+        shots.append(shoot(fns, latents, cfg, generators, before))  # type: ignore[operator]
         return shots[-1]
 
-    original = getattr(mpc, name)
-    monkeypatch.setattr(mpc, name, spy)
-    agent = MPCAgent(ToyModel(), 2, planner)
+    agent = MPCAgent(method, ToyModel(), planner, spy)
     agent.reset(np.ones(2, bool), np.array([1, 2]))
     actions = np.stack([agent.act(frames_at(AHEAD, START)) for _ in range(10)])
     assert len(shots) == 4, "two rows planned one after the other, twice"
@@ -86,7 +87,7 @@ def test_five_actions_are_executed_and_the_next_plan_starts_from_the_shifted_mea
 
 def test_actions_beyond_the_plan_are_refused() -> None:
     with pytest.raises(ConfigError, match="as long as what is executed"):
-        MPCAgent(ToyModel(), 2, MPPIConfig(horizon=3, replan_every=4))
+        MPCAgent("mppi", ToyModel(), MPPIConfig(horizon=3, replan_every=4), mppi.shoot)
 
 
 def test_the_best_candidate_wins_and_a_rollout_counts_by_the_best_that_it_meets() -> None:
@@ -119,7 +120,7 @@ class ToyManager:
 
 
 def iris(settings: IRISConfig, **changes: object) -> IRISAgent:
-    return IRISAgent("iris", ToyModel(**changes), 2, ToyManager(), settings)  # type: ignore[arg-type]
+    return IRISAgent("iris", ToyModel(**changes), ToyManager(), settings)  # type: ignore[arg-type]
 
 
 def test_iris_climbs_its_value_and_stops_where_it_misleads() -> None:
@@ -130,7 +131,7 @@ def test_iris_climbs_its_value_and_stops_where_it_misleads() -> None:
 
 def test_many_subgoals_ahead_see_around_the_wall() -> None:
     before_the_wall = (-1.0, 2.0)
-    assert solves(iris(MULTISTEP), before_the_wall, limit=120)
+    assert solves(iris(MULTISTEP_IRIS), before_the_wall, limit=120)
     assert not solves(iris(IRISConfig()), before_the_wall, limit=120)
 
 

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from latent_data import SMALL, corridor, joint_checkpoint, noise_store
 from velap.errors import DatasetError
-from velap.models.heads import PolicyHead
+from velap.methods.bc import PAPER_BC, BCConfig, BCLearner, SuccessBCLearner, cloning_error
+from velap.methods.heads import PolicyHead
 from velap.models.velap import load_checkpoint
 from velap.runs import make_generator
-from velap.training.bc import PAPER_BC, BCConfig, BCLearner, SuccessBCLearner, cloning_error
 from velap.training.frozen import LatentData, latent_data
 
 

@@ -13,10 +13,10 @@ from velap.config import ModelConfig
 from velap.data.commands import past_commands
 from velap.data.sampling import WindowSampler
 from velap.errors import ConfigError
-from velap.methods.base import METHODS, make_agent
+from velap.methods.base import get_method, make_agent
 from velap.methods.states import StateEncoder
-from velap.models.heads import HEADS
 from velap.models.velap import COMMAND_SCALE, LatentModel, Spaces
+from velap.registry import METHODS
 from velap.training.latents import encode_all
 from velap.training.loop import Trainer
 from velap.training.pairs import Pairs
@@ -80,8 +80,9 @@ def test_every_method_sees_its_own_past_actions(method):
 
     model.encode = watched  # type: ignore[method-assign]
     head = None
-    if method in HEADS:
-        head = HEADS[method](model.config, 3)
+    kind = get_method(method)
+    if kind.head is not None:
+        head = kind.head(model.config, 3)
         head.method = method
         if hasattr(head, "steps_ahead"):
             head.steps_ahead.fill_(2)

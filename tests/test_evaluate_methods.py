@@ -10,7 +10,9 @@ import torch
 from velap import cli
 from velap.config import override
 from velap.evaluation.records import read_records
-from velap.models.heads import HEADS, SubgoalHead, make_head, save_head
+from velap.methods.base import learning_methods
+from velap.methods.heads import make_head, save_head
+from velap.methods.iris import SubgoalHead
 from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
 from velap.tasks import make_config
 
@@ -84,7 +86,7 @@ def test_records_of_one_head_refuse_another(tmp_path: Path, capsys: pytest.Captu
     assert "`config_hash` is" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("method", HEADS)
+@pytest.mark.parametrize("method", learning_methods())
 def test_a_missing_head_says_how_to_train_it(tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]) -> None:
     checkpoint = make_run(tmp_path / "run")
     checkpoint.with_name(f"{method}.safetensors").unlink(missing_ok=True)

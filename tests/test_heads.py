@@ -13,10 +13,13 @@ import torch
 from latent_data import SMALL, joint_checkpoint, metadata_of, noise_store
 from velap import api, cli
 from velap.errors import CheckpointError, ConfigError, DatasetError, TrainingError, UnknownTaskError
-from velap.models.heads import HEADS, head_path, load_head, make_head, save_head
+from velap.methods import learning
+from velap.methods.base import get_method, learning_methods
+from velap.methods.heads import head_path, load_head, make_head, save_head
+from velap.methods.learning import train_head
+from velap.registry import METHODS
 from velap.runs import load_tensors
-from velap.training import frozen, heads
-from velap.training.heads import JOINT_METHODS, RECIPES, learner_config, train_head
+from velap.training import frozen
 from velap.training.steps import Cadence, Progress
 
 STORE = noise_store(successes=10)
@@ -36,14 +39,14 @@ def same(one: Path, other: Path) -> bool:
     return mine.keys() == others.keys() and all(torch.equal(mine[name], others[name]) for name in mine)
 
 
-def test_every_head_has_a_recipe_and_every_method_a_way_to_train() -> None:
-    from velap.methods.base import METHODS
+def test_every_head_has_a_learner_with_a_config() -> None:
+    assert learning_methods() == ["bc", "bc-success", "iql", "iql-sparse", "iris", "iris-multistep"]
+    for name in METHODS:
+        method = get_method(name)
+        assert {method.learns} == {part is not None for part in (method.learner, method.learning, method.paper_learning)}
 
-    assert RECIPES.keys() == HEADS.keys()
-    assert {*RECIPES, *JOINT_METHODS, "random"} == set(METHODS)
 
-
-@pytest.mark.parametrize("method", HEADS)
+@pytest.mark.parametrize("method", learning_methods())
 @pytest.mark.parametrize("norm", ["layer", "batch"])
 def test_a_head_comes_back_as_it_was_trained(tmp_path: Path, method: str, norm: str) -> None:
     checkpoint = joint_checkpoint(tmp_path / "model.safetensors", STORE, norm=norm)
@@ -56,7 +59,7 @@ def test_a_head_comes_back_as_it_was_trained(tmp_path: Path, method: str, norm: 
     head = load_head(result.path, metadata_of(checkpoint))
     assert not head.training
     assert head.method == method
-    assert json.loads(head.settings) == dataclasses.asdict(learner_config(method, "default", {"steps": 4}))
+    assert json.loads(head.settings) == dataclasses.asdict(get_method(method).learner_config("default", {"steps": 4}))
     metadata = load_tensors(result.path)[1]
     assert (metadata["seed"], metadata["dataset_hash"], metadata["command"]) == ("0", "hash10", "typed")
     assert metadata["weights_sha256"] == head.weights_sha256
@@ -108,7 +111,7 @@ def test_damage_is_noticed(checkpoint: Path) -> None:
 def test_an_interrupted_training_goes_on_to_the_same_bits(
         tmp_path: Path, checkpoint: Path, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = train_head(method, checkpoint, STORE, tmp_path / "whole.safetensors", steps=8).path
-    monkeypatch.setattr(heads, "CADENCE", Cadence(2, 4, 3))
+    monkeypatch.setattr(learning, "CADENCE", Cadence(2, 4, 3))
 
     def stop(progress: Progress) -> None:
         if progress.step == 6:
@@ -129,8 +132,8 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(
 
 def test_a_state_of_other_settings_is_not_gone_on_from(tmp_path: Path, checkpoint: Path, monkeypatch: Any) -> None:
     fresh = train_head("bc", checkpoint, STORE, tmp_path / "fresh.safetensors", steps=6).path
-    monkeypatch.setattr(heads, "CADENCE", Cadence(2, 4, 3))
-    learner = learner_config("bc", "default", {"steps": 8, "batch": 16})
+    monkeypatch.setattr(learning, "CADENCE", Cadence(2, 4, 3))
+    learner = get_method("bc").learner_config("default", {"steps": 8, "batch": 16})
 
     def stop(progress: Progress) -> None:
         if progress.step == 4:
@@ -184,10 +187,10 @@ def test_the_joint_preset_chooses_the_learner(tmp_path: Path) -> None:
 def test_unknown_methods_and_fields_are_named(checkpoint: Path) -> None:
     with pytest.raises(UnknownTaskError, match="the method 'td3bc' has no learner of its own; expected one of bc, "):
         train_head("td3bc", checkpoint, STORE)
-    with pytest.raises(UnknownTaskError, match="cannot train the method 'ppo'; expected one of velap, "):
+    with pytest.raises(UnknownTaskError, match="unknown method 'ppo'; expected one of bc, "):
         api.train("SpiralMaze", method="ppo")
     with pytest.raises(ConfigError, match=r"the learner of 'bc' has no field \['expectile'\]; expected some of \['steps'"):
-        learner_config("bc", "default", {"expectile": 0.9})
+        get_method("bc").learner_config("default", {"expectile": 0.9})
 
 
 def test_another_dataset_is_refused(checkpoint: Path) -> None:
@@ -230,7 +233,7 @@ def test_the_command_line_trains_a_head_beside_the_joint_checkpoint(
     assert "trained with other values of some of train.c1" in capsys.readouterr().err
     assert cli.main(["train", "--dataset", "test", "--out", folder, "--method", "mppi"]) == 0, "nothing more to learn"
     assert cli.main(["train", "SpiralMaze", "--method", "random"]) == 2
-    assert "`random` has nothing to learn" in capsys.readouterr().err
+    assert "'random': it has nothing to learn" in capsys.readouterr().err
     assert cli.main(["train", "--dataset", "test", "--out", folder, "--set", "head.steps=3"]) == 2
     assert "PART.FIELD=VALUE" in capsys.readouterr().err
 

@@ -156,7 +156,7 @@ def test_the_clone_acts_near_the_goal_and_the_held_policy_before():
     model = ToyModel(act_success=away)
     agent = VelapAgent(model, settings)
     toward = agent.act(frames)
-    assert agent.led_by_success.tolist() == [True, False]
+    assert agent.led.tolist() == [True, False]
     np.testing.assert_allclose(toward[0], [-1.0, -1.0], atol=0.03)
     assert toward[1, 0] > 1.5, "π^g leads where there is no held policy"
     model.held_policy = up
@@ -170,7 +170,7 @@ def test_revisits_do_not_take_the_lead_from_the_clone_before_they_call_for_a_pla
     frames, led, planned = np.stack([[draw(np.array(GOAL) - [2.0, 0.0])] * 2]), [], []
     for _ in range(12):
         agent.act(frames)
-        led.append(bool(agent.led_by_success[0]))
+        led.append(bool(agent.led[0]))
         planned.append(not bool(agent.near_goal[0]))
     below = float(agent.last_values[0])
     assert led[0] and led[2] and not led[-1] and planned[-1] and below < 0.96**6
@@ -183,7 +183,8 @@ def test_the_held_policy_and_the_global_one_take_turns():
     model = ToyModel()
     model.held_policy = lambda z: z.new_tensor([0.0, -0.5]).expand_as(z)
     agent, frames = VelapAgent(model, settings), np.stack([[draw(np.array(GOAL) - [3.0, 0.0])] * 2] * 2)
-    assert agent.leader == "held or global policy" and VelapAgent(ToyModel(), toy_config()).leader == "global policy"
+    assert agent.global_policy == "held or global policy"
+    assert VelapAgent(ToyModel(), toy_config()).global_policy == "global policy"
     down = []
     for step in range(7):
         if step == 3:

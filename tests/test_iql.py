@@ -10,18 +10,18 @@ import torch
 
 from latent_data import SMALL, corridor
 from velap.errors import ConfigError
-from velap.models.heads import IQLHead
-from velap.runs import make_generator
-from velap.training.frozen import LatentData
-from velap.training.iql import (
+from velap.methods.iql import (
     PAPER_IQL,
     PAPER_SPARSE_IQL,
     SPARSE_IQL,
     IQLConfig,
+    IQLHead,
     IQLLearner,
     advantage_weights,
     expectile_loss,
 )
+from velap.runs import make_generator
+from velap.training.frozen import LatentData
 
 ROWS = torch.tensor([0, 1, 2, 3])
 

@@ -11,20 +11,12 @@ import torch
 from velap.config import Config, ModelConfig
 from velap.config.training import TrainConfig
 from velap.data.frames import FrameStore
-from velap.data.sampling import FirstTransitions, WholeWindows
 from velap.errors import CheckpointError, ConfigError, DatasetError
 from velap.models.velap import load_checkpoint
 from velap.runs import load_tensors
 from velap.training.joint import rollouts
 from velap.training.loop import MODEL, STATE, Trainer, train
 from velap.training.pairs import Pairs
-
-
-def whole(run: Trainer, windows: int, length: int) -> WholeWindows:
-    """Whole windows with the shares of a run's config."""
-    train = run.config.train
-    return WholeWindows(windows, length, train.value_transitions, train.dynamics_rollouts, train.dynamics_horizon)
-
 
 SMALL = ModelConfig(
     frame_stack=2,
@@ -135,7 +127,7 @@ def test_model_loss_reaches_encoder_dynamics_and_critics_only(tmp_path, norm):
 def test_policy_step_reaches_policies_and_action_model_only(tmp_path, norm):
     run = trainer(tmp_path, norm)
     learner, model = run.learner, run.model
-    batch = run.sampler.sample(whole(run, 3, 5), run.generator)
+    batch = run.sampler.sample(3, 5, True, run.generator)
     before = {k: v.clone() for k, v in model.state_dict().items()}
     learner._update_policies(model.encode(run.sampler.stacks(batch.rows)).detach(), batch)
     changed = {
@@ -159,7 +151,7 @@ def test_targets_follow_slowly_and_have_no_gradient(tmp_path):
 def test_evaluated_networks_keep_their_batch_statistics(tmp_path):
     run = trainer(tmp_path, "batch")
     learner, model = run.learner, run.model
-    batch = run.sampler.sample(whole(run, 3, 5), run.generator)
+    batch = run.sampler.sample(3, 5, True, run.generator)
     latents = model.encode(run.sampler.stacks(batch.rows)).detach()
     policies = [b.clone() for b in model.local_policy.buffers()]
     learner.value_loss(latents, batch)
@@ -171,7 +163,7 @@ def test_evaluated_networks_keep_their_batch_statistics(tmp_path):
 
 def test_rollouts_chain_the_dynamics_along_the_data(tmp_path):
     run = trainer(tmp_path)
-    batch = run.sampler.sample(whole(run, 3, 5), run.generator)
+    batch = run.sampler.sample(3, 5, True, run.generator)
     latents = torch.randn(len(batch.rows), 4)
     predicted, truth, valid = rollouts(run.model, latents, batch, 3)
     assert predicted.shape == (3, 9, 4)
@@ -184,16 +176,16 @@ def test_rollouts_chain_the_dynamics_along_the_data(tmp_path):
 
 def test_a_part_of_the_transitions_is_drawn_anew_for_every_batch(tmp_path):
     run = trainer(tmp_path, value_transitions=7, dynamics_rollouts=4)
-    batches = [run.sampler.sample(whole(run, 3, 5), run.generator) for _ in range(40)]
+    batches = [run.sampler.sample(3, 5, True, run.generator) for _ in range(40)]
     for batch in batches:
-        assert len(batch.now_at.unique()) == len(batch.now_at) == len(batch.weight) == len(batch.goal_at) == 7
-        assert len(batch.unroll_at.unique()) == len(batch.unroll_at) == 4 and (batch.unroll_at % 6 <= 2).all()
-        inside = batch.valid[batch.now_at // 6, batch.now_at % 6]
+        assert len(batch.start.unique()) == len(batch.start) == len(batch.weight) == len(batch.goals.position) == 7
+        assert len(batch.unrolled.unique()) == len(batch.unrolled) == 4 and (batch.unrolled % 6 <= 2).all()
+        inside = batch.valid[batch.start // 6, batch.start % 6]
         assert torch.equal(batch.weight, inside.float())
-        assert torch.equal(batch.action, batch.actions[batch.now_at // 6, batch.now_at % 6])
-    assert len(torch.cat([batch.now_at for batch in batches]).unique()) == 15  # the last frame of a window starts nothing
-    only_first = run.sampler.sample(FirstTransitions(3, 5), run.generator)
-    assert only_first.now_at.tolist() == only_first.unroll_at.tolist() == [0, 6, 12]
+        assert torch.equal(batch.action, batch.actions[batch.start // 6, batch.start % 6])
+    assert len(torch.cat([batch.start for batch in batches]).unique()) == 15  # the last frame of a window starts nothing
+    only_first = run.sampler.sample(3, 5, False, run.generator)
+    assert only_first.start.tolist() == only_first.unrolled.tolist() == [0, 6, 12]
 
 
 def test_latent_phase_leaves_the_encoder_alone(tmp_path):
@@ -261,7 +253,7 @@ def test_the_critics_loss_and_the_policies_gain_are_those_of_the_config(tmp_path
         "floor": {"critic_loss": "cross_entropy", "critic_floor": 0.01}}.items()}
     infos = {}
     for name, run in runs.items():
-        batch = run.sampler.sample(whole(run, 8, 3), torch.Generator().manual_seed(0))
+        batch = run.sampler.sample(8, 3, True, torch.Generator().manual_seed(0))
         latents = run.model.encode(run.sampler.stacks(batch.rows)).detach()
         infos[name] = run.learner.value_loss(latents, batch)[1] | run.learner.acting_loss(latents, batch)[1]
     plain, entropy, relative = infos["plain"], infos["entropy"], infos["relative"]

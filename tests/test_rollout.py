@@ -12,7 +12,7 @@ from toy_env import SIDE, ToyEnv, ToyModel, toy_config, toy_env
 from velap.errors import ConfigError, DatasetError
 from velap.evaluation.rollout import Episode, FrameReader, Rollout, make_envs, succeeded
 from velap.methods.base import Agent, make_agent
-from velap.methods.reactive import RandomAgent
+from velap.methods.random import RandomAgent
 
 
 def toy_agent(method: str = "velap", **planner: object) -> Agent:
@@ -128,7 +128,7 @@ class Foreign(gym.Env[Any, Any]):
 
 def test_a_foreign_environment_is_read_by_the_rules_of_datasets() -> None:
     env = Foreign()
-    episodes = list(Rollout([env], RandomAgent(env.action_space), FrameReader(env, 8, "camera")).run([3]))
+    episodes = list(Rollout([env], RandomAgent(env.action_space, 1), FrameReader(env, 8, "camera")).run([3]))
     assert episodes == [Episode(seed=3, success=True, steps=1, truncated=False, plan_ms=())]
     assert env.options == [None]
     image = FrameReader(env, 8)(env._observe())

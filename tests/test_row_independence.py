@@ -52,8 +52,8 @@ def actions_of(agent: VelapAgent, seeds: tuple[int, ...], batch: int) -> tuple[d
     modes: set[tuple[bool, ...]] = set()
 
     def watch(row: int, seed: int, env: gym.Env[Any, Any], acting: object, outcome: object) -> None:
-        following = len(agent.waypoints_ahead(row)) > 0 and not agent.near_goal[row]
-        modes.add((bool(row in agent.planned_rows), bool(agent.near_goal[row]), bool(agent.led_by_success[row]), following))
+        following = len(agent.plans.ahead(row)) > 0 and not agent.near_goal[row]
+        modes.add((bool(row in agent.planned_rows), bool(agent.near_goal[row]), bool(agent.led[row]), following))
 
     envs: list[gym.Env[Any, Any]] = [RecordingEnv(taken) for _ in range(batch)]
     rollout = Rollout(envs, agent, FrameReader(envs[0], SIDE, None), max_steps=STEPS, observer=watch)

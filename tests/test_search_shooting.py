@@ -9,16 +9,10 @@ import torch
 
 from toy_world import DISCOUNT, GOAL, SPEED, START, misleading_value, move, roots, row_generators, toy_fns
 from velap.errors import ConfigError
-from velap.search.shooting import (
-    MBOPConfig,
-    MPPIConfig,
-    choose_elites,
-    mixed_rollouts,
-    score,
-    shift_mean,
-    shoot,
-    shoot_mbop,
-)
+from velap.methods import mbop
+from velap.methods.mbop import MBOPConfig, mixed_rollouts
+from velap.methods.mppi import MPPIConfig, shoot
+from velap.search.shooting import choose_elites, score, shift_mean
 from velap.search.types import SearchFns
 
 SMALL = MPPIConfig(samples=200, horizon=12, elites=20, iterations=4, policy_share=0.0)
@@ -167,16 +161,16 @@ def test_each_iteration_of_mbop_mixes_with_the_plan_before() -> None:
     always = line()._replace(act_global=lambda z: torch.ones_like(z))
     cfg = MBOPConfig(samples=4, horizon=3, elites=2, iterations=5, beta=0.7, noise_std=0.0)
     root = torch.zeros(1, 1, dtype=torch.float64)
-    shot = shoot_mbop(always, root, cfg, row_generators(1))
+    shot = mbop.shoot(always, root, cfg, row_generators(1))
     assert shot.actions.flatten().tolist() == pytest.approx([1 - 0.7**5] * 3)
-    warm = shoot_mbop(always, root, cfg, row_generators(1), torch.full((1, 3, 1), 0.5, dtype=torch.float64))
+    warm = mbop.shoot(always, root, cfg, row_generators(1), torch.full((1, 3, 1), 0.5, dtype=torch.float64))
     assert warm.actions.flatten().tolist() == pytest.approx([1 - 0.5 * 0.7**5] * 3)
 
 
 def test_mbop_follows_its_policy_to_the_goal_or_into_the_wall() -> None:
     cfg = MBOPConfig(samples=50, horizon=14, elites=8, iterations=5)
     z_root = torch.tensor([[1.0, -4.0], [3.0, 7.0], [9.0, 2.0], START], dtype=torch.float64)
-    shot = shoot_mbop(toy_fns(), z_root, cfg, row_generators(4))
+    shot = mbop.shoot(toy_fns(), z_root, cfg, row_generators(4))
     assert shot.actions.shape == (4, 14, 2)
     assert shot.actions.abs().max() <= 1
     ends = execute(z_root, shot.actions)
@@ -184,7 +178,7 @@ def test_mbop_follows_its_policy_to_the_goal_or_into_the_wall() -> None:
     assert ends[3, 0] < 0
 
 
-@pytest.mark.parametrize("shooter", [shoot, shoot_mbop])
+@pytest.mark.parametrize("shooter", [shoot, mbop.shoot])
 def test_rows_of_both_are_independent(shooter) -> None:
     cfg = SMALL if shooter is shoot else MBOPConfig(samples=20, horizon=4, elites=4, iterations=2)
     z_root = roots(3, spread=3.0)

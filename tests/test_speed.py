@@ -21,7 +21,7 @@ from velap.config import Config, override
 from velap.data.frames import content_hash, load_store, write_dataset
 from velap.envs.gl import BACKENDS
 from velap.errors import CheckpointError, ConfigError
-from velap.search.shooting import MPPIConfig
+from velap.methods.mppi import MPPIConfig
 from velap.tasks import make_config
 
 CPU = torch.device("cpu")

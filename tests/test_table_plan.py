@@ -22,7 +22,7 @@ from table_cells import Pretended, fill, inventory
 from velap import cli
 from velap.config import override
 from velap.errors import ConfigError, UnknownTaskError
-from velap.models.heads import HEADS
+from velap.methods.base import learning_methods
 from velap.models.velap import WEIGHTS_SHA256, LatentModel, Spaces, save_checkpoint
 from velap.tasks import make_config
 
@@ -98,7 +98,7 @@ def test_a_chain_is_dataset_joint_head_evaluation() -> None:
 def test_a_plan_holds_each_job_once_and_after_what_it_needs() -> None:
     cells = everything().cells()
     plan = make_plan(cells, Pretended(), PLAIN)
-    tasks, heads = len(everything().tasks), len(HEADS)
+    tasks, heads = len(everything().tasks), len(learning_methods())
     assert len(plan) == tasks + tasks + tasks * heads + len(cells)
     seen: set[str] = set()
     for job in plan:

@@ -69,7 +69,7 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         preset: `default` or `paper`.
         seed: decides weights and batches.
         out: run directory; None takes `runs/<task>/<preset>/seed<seed>`.
-        method: one of `velap.methods.base.METHODS`.
+        method: a name in `velap.registry.METHODS`.
         image_key: key of the image in dict observations.
         device: `auto`, `cpu` or `cuda`.
         resume: go on with the joint run in `out`; a finished one is left as it is. Heads always go on.
@@ -79,15 +79,16 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         on_progress: called after every logged step.
     """
     from velap.data.frames import load_store
-    from velap.models.heads import HEADS
-    from velap.training.heads import check_trainable, learner_config, train_head
+    from velap.methods.base import get_method
+    from velap.methods.learning import check_trainable, train_head
     from velap.training.loop import MODEL
     from velap.training.loop import train as run
 
     check_trainable(method)
     task, changes = task_of(task_or_dataset), dict(changes or {})
     of_head = changes.pop("head", {})
-    learner = learner_config(method, preset, of_head) if method in HEADS or of_head else None
+    kind = get_method(method)
+    learner = kind.learner_config(preset, of_head) if kind.learns or of_head else None
     config = config_for(task, preset, changes)
     dataset_id = TASKS[task_or_dataset].dataset_id if task_or_dataset in TASKS else task_or_dataset
     store = load_store(dataset_id, image_key, min_length=config.train.dynamics_horizon)
@@ -133,18 +134,18 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
 
     Args:
         checkpoint: `model.safetensors` of a run.
-        method: one of `velap.methods.base.METHODS`, such as `velap`, or `td3bc` for π^g alone.
+        method: a name in `velap.registry.METHODS`, such as `velap`, or `td3bc` for π^g alone.
         device: `auto`, `cpu` or `cuda`.
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
     """
-    from velap.methods.base import make_agent
-    from velap.models.heads import HEADS, head_path, load_head
+    from velap.methods.base import get_method, make_agent
+    from velap.methods.heads import head_path, load_head
     from velap.models.velap import load_checkpoint
     from velap.training.loop import pick_device
 
     model, config, metadata = load_checkpoint(Path(checkpoint), pick_device(device))
     learnt = None
-    if method in HEADS:
+    if get_method(method).learns:
         learnt = load_head(head or head_path(checkpoint, method), metadata, pick_device(device))
     bounds = np.array([model.spaces.action_low, model.spaces.action_high], np.float32)
     return make_agent(method, model, config, gym.spaces.Box(bounds[0], bounds[1], dtype=np.float32), learnt)
@@ -160,7 +161,7 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
     Args:
         task: task name; with `env`, any label.
         checkpoint: `model.safetensors` of a run; `random` needs none.
-        method: one of `velap.methods.base.METHODS`.
+        method: a name in `velap.registry.METHODS`.
         episodes: number of episodes.
         first_seed: seed of the first one; test seeds are 0 to 99.
         env: any Gymnasium id instead of the task's own environment.

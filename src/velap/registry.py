@@ -30,7 +30,7 @@ Entry = TypeVar("Entry")
 
 
 class Registry(Mapping[str, T], Generic[T]):
-    """Entries of one kind by name: the package's own in alphabetical order of their modules, then those added later."""
+    """Entries of one kind by name: in their order where one module of the package has them all, else in the alphabet's."""
 
     def __init__(self, kind: str, home: str) -> None:
         """`home` is the module or folder of the package's own entries."""
@@ -70,8 +70,9 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def __iter__(self) -> Iterator[str]:
         """All names; entries of other packages are named without being imported."""
-        self._import_home()
-        return iter(dict.fromkeys((*self._entries, *self._plugins())))
+        spread = self._import_home()
+        own = sorted(self._entries) if spread else self._entries
+        return iter(dict.fromkeys((*own, *self._plugins())))
 
     def __len__(self) -> int:
         return len(list(iter(self)))
@@ -79,18 +80,19 @@ class Registry(Mapping[str, T], Generic[T]):
     def __contains__(self, name: object) -> bool:
         return name in list(self)
 
-    def _import_home(self) -> None:
-        """Import every module of the home, whose decorators fill the registry."""
-        if self._complete:
-            return
-        self._complete = True  # before the imports, which may look into the registry themselves
-        try:
-            home = import_module(self._home)
-            for module in pkgutil.iter_modules(getattr(home, "__path__", ())):
-                import_module(f"{self._home}.{module.name}")
-        except BaseException:
-            self._complete = False
-            raise
+    def _import_home(self) -> bool:
+        """Import every module of the home, whose decorators fill the registry; says whether it is a folder."""
+        home = import_module(self._home)
+        folder = getattr(home, "__path__", None)
+        if folder is not None and not self._complete:
+            self._complete = True  # before the imports, which may look into the registry themselves
+            try:
+                for module in pkgutil.iter_modules(folder):
+                    import_module(f"{self._home}.{module.name}")
+            except BaseException:
+                self._complete = False
+                raise
+        return folder is not None
 
     def _plugins(self) -> dict[str, EntryPoint]:
         """Entry points of installed packages by name."""

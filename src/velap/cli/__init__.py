@@ -24,10 +24,8 @@ ERR = Console(stderr=True, highlight=False)
 
 Task = Annotated[Positional[str], arg(help="Task name, see `velap info`.")]
 Preset = Annotated[Literal["default", "paper"], arg(help="`paper` is Tables 2-10 alone, `default` what measured best.")]
-Method = Annotated[
-    Literal["velap", "bc", "bc-success", "td3bc", "iql", "iql-sparse", "mppi", "mbop", "iris", "iris-multistep", "random"],
-    arg(help="VELAP, a baseline of Table 1 (`td3bc` is π^g alone, `iql-sparse` is IQL as its authors set it for sparse "
-             "rewards), or uniform actions.")]
+Method = Annotated[str, arg(help="Registered method: `velap`, a baseline of Table 1 (`bc`, `bc-success`, `td3bc`, `iql`, "
+                                 "`mppi`, `mbop`, `iris`, `iris-multistep`), `iql-sparse`, `random`, or one of yours.")]
 Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="`auto` takes CUDA where there is one.")]
 Settings = Annotated[tuple[tuple[str, ...], ...], UseAppendAction,
                      arg(name="set", help="Config fields to replace, such as `planner.n_iter=500`.")]
@@ -94,12 +92,12 @@ def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str
     """Train with a progress bar; returns the joint checkpoint."""
     from velap import api
     from velap.evaluation.console import TrainView
-    from velap.models.heads import HEADS
-    from velap.training.heads import learner_config
+    from velap.methods.base import get_method
     from velap.training.loop import MODEL
 
-    learns = method in HEADS
-    changes = parse_settings(settings, {"head": learner_config(method, preset)} if learns else {})
+    kind = get_method(method)
+    learns = kind.learns
+    changes = parse_settings(settings, {"head": kind.learner_config(preset)} if learns else {})
     directory = out or api.run_dir(api.task_of(source), preset, seed)
     if learns and not (directory / MODEL).exists():
         ERR.print(f"note: no joint checkpoint in {directory}; it is trained first", markup=False, soft_wrap=True)
@@ -116,8 +114,8 @@ def _train(source: str, preset: str, seed: int, out: Path | None, image_key: str
 
 def _show_head(checkpoint: Path, method: str) -> None:
     """Where the head is, how long it took, and its held-out losses."""
-    from velap.models.heads import head_path
-    from velap.training.heads import read_result
+    from velap.methods.heads import head_path
+    from velap.methods.learning import read_result
 
     result = read_result(head_path(checkpoint, method))
     losses = ", ".join(f"{name} {value:.3g}" for name, value in result.diagnostics.items())
@@ -149,9 +147,9 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
     """
     from velap.cli.settings import parse_pairs
     from velap.evaluation.evaluate import Evaluation
-    from velap.methods.base import SETTINGS
+    from velap.methods.base import get_method
 
-    changes = parse_settings(settings, {method: SETTINGS[method]} if method in SETTINGS else {})
+    changes = parse_settings(settings, {method: get_method(method).settings})
     what = Evaluation(task, method=method, checkpoint=checkpoint, preset=preset, env=env, env_kwargs=parse_pairs(env_kwargs),
                       image_key=image_key, max_steps=max_steps, success_reward=success_reward, device=device,
                       changes=changes, head=head)

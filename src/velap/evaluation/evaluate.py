@@ -20,8 +20,8 @@ from velap.data.images import IMAGE_SIZE
 from velap.errors import ConfigError, UnknownTaskError
 from velap.evaluation.records import Record, RecordFile, RunKey, select
 from velap.evaluation.rollout import Episode, FrameReader, Observer, Rollout, make_envs
-from velap.methods.base import Agent, Settings, check_method, make_agent, method_hash, method_settings
-from velap.models.heads import HEADS, AnyHead, head_path, load_head
+from velap.methods.base import Agent, get_method, learning_methods, make_agent
+from velap.methods.heads import Head, head_path, load_head
 from velap.models.velap import WEIGHTS_SHA256, LatentModel, load_checkpoint, shared_weights
 from velap.tasks import TASKS, get_task, make_config
 
@@ -96,7 +96,7 @@ def load_player(what: Evaluation) -> Player:
     """Load the checkpoint, make the agent, and check that model, camera and time limit fit the environment."""
     task_env = TASKS[what.task].env_id if what.task in TASKS else None
     env_id = what.env or get_task(what.task).env_id
-    check_method(what.method)
+    method = get_method(what.method)
     loaded = _load_model(what)
     model, config = loaded.model, loaded.config
     if what.env is None and config.task != what.task:
@@ -113,7 +113,7 @@ def load_player(what: Evaluation) -> Player:
     key = RunKey(task=what.task if env_id == task_env else env_id, method=what.method, preset=config.preset,
                  train_seed=loaded.seed, env=env_id, env_kwargs=what.env_kwargs, image_key=what.image_key,
                  max_steps=max_steps, success_reward=what.success_reward,
-                 config_hash=method_hash(config, what.method, loaded.head, loaded.settings), checkpoint=loaded.digest,
+                 config_hash=method.config_hash(config, loaded.head, loaded.settings), checkpoint=loaded.digest,
                  code_version=code_version())
     return Player(agent=agent, model=model, config=config, key=key, image_size=size,
                   make_env=lambda: make_env(env_id, what.env_kwargs))
@@ -138,8 +138,8 @@ class _Loaded(NamedTuple):
     """Training seed."""
     digest: str
     """Hash of the joint weights, for other methods than VELAP of those that all share."""
-    head: AnyHead | None = None
-    settings: Settings | None = None
+    head: Head | None = None
+    settings: Any = None
 
 
 def _load_model(what: Evaluation) -> _Loaded:
@@ -147,10 +147,11 @@ def _load_model(what: Evaluation) -> _Loaded:
     from velap.config import override
     from velap.training.loop import pick_device
 
-    if what.head is not None and what.method not in HEADS:
-        raise ConfigError(f"method {what.method!r} learns no head and got {what.head}; expected one of {', '.join(HEADS)}. "
-                          "Leave --head out, or name that method.")
-    if what.method == "random":
+    method = get_method(what.method)
+    if what.head is not None and not method.learns:
+        raise ConfigError(f"method {what.method!r} learns no head and got {what.head}; expected one of "
+                          f"{', '.join(learning_methods())}. Leave --head out, or name that method.")
+    if not method.needs_model:
         return _Loaded(None, make_config(what.task, what.preset), 0, "")
     if what.checkpoint is None:
         raise ConfigError(f"method {what.method!r} acts by a trained model and got none; name one with --checkpoint, or "
@@ -158,12 +159,12 @@ def _load_model(what: Evaluation) -> _Loaded:
     device = pick_device(what.device)
     model, config, metadata = load_checkpoint(what.checkpoint, device)
     changes = dict(what.changes or {})
-    settings = method_settings(what.method, changes.pop(what.method, None), config.preset)
+    settings = method.settings_of(config.preset, changes.pop(what.method, None))
     head = None
-    if what.method in HEADS:
+    if method.learns:
         head = load_head(what.head or head_path(what.checkpoint, what.method), metadata, device)
     seed = int(metadata.get("seed", 0))
-    digest = metadata[WEIGHTS_SHA256] if what.method == "velap" else shared_weights(metadata)
+    digest = metadata[WEIGHTS_SHA256] if method.whole_checkpoint else shared_weights(metadata)
     return _Loaded(model, override(config, **changes), seed, digest, head, settings)
 
 

@@ -1,57 +1,37 @@
-"""The `Agent` protocol: what acts in a batch of environments, and the registry of the methods that do.
+"""What acts (`Agent`), and what a method consists of (`Method`): its name in tables, what it learns, how it acts.
 
-B environments, N stacked frames, A action dimensions.
+B environments, N stacked frames, A action dimension.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import asdict, dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from velap.errors import ConfigError, UnknownTaskError
-from velap.models.heads import HEADS
-from velap.search.manager import MULTISTEP, IRISConfig
-from velap.search.shooting import MBOPConfig, MPPIConfig
+from velap.registry import METHODS
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
 
     from velap.config import Config
-    from velap.models.heads import AnyHead
+    from velap.methods.heads import Head
     from velap.models.velap import LatentModel
-
-METHODS = ("velap", "bc", "bc-success", "td3bc", "iql", "iql-sparse", "mppi", "mbop", "iris", "iris-multistep", "random")
-"""Methods of this package, in the names that records and tables use: those of Table 1, IQL with the sparse-reward setting
-of its authors, and uniform actions."""
-Settings = MPPIConfig | MBOPConfig | IRISConfig
-SETTINGS: dict[str, Settings] = {
-    "mppi": MPPIConfig(goal_ends=True), "mbop": MBOPConfig(goal_ends=True),
-    "iris": IRISConfig(), "iris-multistep": MULTISTEP,
-}
-"""How the planning baselines plan in the default preset. VELAP's planner is the checkpoint's `planner` and `controller`."""
-PAPER_SETTINGS: dict[str, Settings] = {**SETTINGS, "mppi": MPPIConfig(), "mbop": MBOPConfig()}
-"""The same in the `paper` preset."""
-
-
-class Learnt(Protocol):
-    """What a head says of itself; a file's metadata says it as well."""
-
-    settings: str
-    """Canonical JSON of the learner's config."""
-    weights_sha256: str
+    from velap.training.frozen import FrozenLearner, LearnerConfig
 
 
 class Agent(Protocol):
     """Acts in B environments at once; rows never influence each other."""
 
     method: str
-    """Name in records and tables, one of `METHODS`."""
+    """Name in records and tables."""
     frame_stack: int
     """N, frames a state [frames]."""
     last_plan_ms: NDArray[np.float64]
@@ -69,94 +49,149 @@ class Agent(Protocol):
         ...
 
 
-def method_settings(method: str, changes: Mapping[str, Any] | None = None, preset: str = "default") -> Settings | None:
-    """How a method plans, with the fields of `changes` replaced; None for a method that is not in `SETTINGS`."""
-    check_method(method)
-    settings = (PAPER_SETTINGS if preset == "paper" else SETTINGS).get(method)
-    if not changes:
-        return settings
-    names = [field.name for field in fields(settings)] if settings is not None else []
-    unknown = sorted(set(changes) - set(names))
-    if unknown or settings is None:
-        raise ConfigError(f"the method {method!r} has no field {unknown}; expected some of {names}.")
-    return replace(settings, **changes)
+@dataclass(frozen=True)
+class Parts:
+    """What an agent can be made of."""
+
+    model: LatentModel
+    """In evaluation mode."""
+    config: Config
+    """The model's."""
+    action_space: Box
+    """The environment's."""
+    settings: Any
+    """One of the method's `settings`; None where it has none."""
+    head: Any
+    """What the method learnt beside the model, of the type `Method.head`; None where it learns nothing."""
 
 
-def method_hash(config: Config, method: str, head: Learnt | None = None, settings: Settings | None = None) -> str:
-    """The `config_hash` of a method's records: its joint config, and what else decides how it acts.
+class Learnt(Protocol):
+    """What a head says of itself; a file's metadata says it as well."""
 
-    VELAP's is that config's own hash. The others leave out planner, controller and the policy of successes, which they have
-    no use for. `settings` None takes those of the config's preset.
+    settings: str
+    """Canonical JSON of the learner's config."""
+    weights_sha256: str
+
+
+class Method(ABC):
+    """A method, by the name that records and tables use. Subclass it, and add it by `velap.register_method`:
+
+        @register_method("mine")
+        class Mine(Method):
+            label = "My baseline"
+
+            def agent(self, parts: Parts) -> Agent:
+                return ReactiveAgent(self.name, parts.model, parts.model.act_global)
     """
-    if method == "velap":
-        return config.hash()
-    settings = settings or method_settings(method, preset=config.preset)
-    plain = asdict(settings) if settings is not None else {}
-    parts = {"config": config.shared_json(), "method": method, "settings": plain}
-    if method in HEADS:
-        if head is None:
-            raise ConfigError(f"the method {method!r} acts by a head and got none; train it with `velap train TASK --method "
-                              f"{method}`.")
-        parts |= {"head": head.settings, "head_weights": head.weights_sha256}
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
+
+    label: ClassVar[str]
+    """How tables print it."""
+    settings: ClassVar[Any] = None
+    """How it acts: a frozen dataclass, whose fields `velap evaluate --set NAME.FIELD=VALUE` replaces; None has no choice."""
+    paper_settings: ClassVar[Any] = None
+    """The same in the preset `paper`; None takes `settings`."""
+    head: ClassVar[type[Head] | None] = None
+    """Network that it learns on frozen latents; None where it acts by the joint checkpoint alone."""
+    learner: ClassVar[type[FrozenLearner[Any, Any]] | None] = None
+    """What learns the head."""
+    learning: ClassVar[LearnerConfig | None] = None
+    """The learner's config."""
+    paper_learning: ClassVar[LearnerConfig | None] = None
+    """The same in the preset `paper`; None takes `learning`."""
+    needs_model: ClassVar[bool] = True
+    """Whether it acts by a trained model at all."""
+    whole_checkpoint: ClassVar[bool] = False
+    """Whether it acts by all of the checkpoint's weights and config, or by those alone that all methods share."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @abstractmethod
+    def agent(self, parts: Parts) -> Agent:
+        """An agent that acts by this method."""
+
+    @property
+    def learns(self) -> bool:
+        """Whether something is learnt for it beside the joint checkpoint."""
+        return self.head is not None
+
+    def settings_of(self, preset: str, changes: Mapping[str, Any] | None = None) -> Any:
+        """How it plans in a preset with the fields of `changes` replaced; None where it has no settings."""
+        settings = self.paper_settings if preset == "paper" and self.paper_settings is not None else self.settings
+        return _changed(f"the method {self.name!r}", settings, changes)
+
+    def learner_config(self, preset: str, changes: Mapping[str, Any] | None = None) -> LearnerConfig:
+        """How it learns in a preset with the fields of `changes` replaced; raises UnknownTaskError if nothing is learnt."""
+        if not self.learns:
+            raise self.nothing_to_learn()
+        config = self.paper_learning if preset == "paper" and self.paper_learning is not None else self.learning
+        changed: LearnerConfig = _changed(f"the learner of {self.name!r}", config, changes)
+        return changed
+
+    def nothing_to_learn(self) -> UnknownTaskError:
+        """The error of who asks for a learner or a head where there is none."""
+        return UnknownTaskError(f"the method {self.name!r} has no learner of its own; expected one of "
+                                f"{', '.join(learning_methods())}. The others act by the joint checkpoint alone: `velap "
+                                "train TASK`.")
+
+    def config_hash(self, config: Config, head: Learnt | None = None, settings: Any = None) -> str:
+        """The `config_hash` of its records: all that decides how it acts. `settings` None takes the preset's."""
+        settings = settings or self.settings_of(config.preset)
+        parts: dict[str, Any] = {"method": self.name, "settings": asdict(settings) if settings is not None else {},
+                                 "config": config.to_json() if self.whole_checkpoint else config.shared_json()}
+        if self.learns:
+            if head is None:
+                raise ConfigError(f"the method {self.name!r} acts by a head and got none; train it with `velap train TASK "
+                                  f"--method {self.name}`.")
+            parts |= {"head": head.settings, "head_weights": head.weights_sha256}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def check_method(method: str) -> None:
-    """Raises UnknownTaskError unless `method` is registered."""
-    if method not in METHODS:
-        raise UnknownTaskError(f"unknown method {method!r}; expected one of {', '.join(METHODS)}.")
+def _changed(owner: str, defaults: Any, changes: Mapping[str, Any] | None) -> Any:
+    """A dataclass, or None, with the fields of `changes` replaced; raises ConfigError for a field that it has not."""
+    names = [field.name for field in fields(defaults)] if defaults is not None else []
+    unknown = sorted(set(changes or {}) - set(names))
+    if unknown:
+        raise ConfigError(f"{owner} has no field {unknown}; expected some of {names}.")
+    return replace(defaults, **changes) if changes else defaults
 
 
-def make_agent(method: str, model: LatentModel | None, config: Config, action_space: Box, head: AnyHead | None = None,
-               settings: Settings | None = None) -> Agent:
-    """The agent of that name.
+def get_method(name: str) -> Method:
+    """The method of that name; raises UnknownTaskError with the names that exist."""
+    found: Method = METHODS[name](name)
+    return found
+
+
+def learning_methods() -> list[str]:
+    """Names of the methods that learn something beside the joint checkpoint."""
+    return [name for name in METHODS if get_method(name).learns]
+
+
+def make_agent(method: str, model: LatentModel | None, config: Config, action_space: Box, head: Head | None = None,
+               settings: Any = None) -> Agent:
+    """The agent of a registered method.
 
     Args:
-        method: one of `METHODS`.
-        model: what all but `random` act by; put into evaluation mode.
+        method: a name in `velap.registry.METHODS`.
+        model: what it acts by; put into evaluation mode. None for a method that needs none.
         config: of the model.
         action_space: the environment's.
-        head: what a method in `velap.models.heads.HEADS` learnt beside the model.
-        settings: how a planning baseline plans; None takes those of the config's preset.
+        head: what the method learnt beside the model.
+        settings: how it plans; None takes the settings of the config's preset.
     """
-    from velap.methods.reactive import RandomAgent, ReactiveAgent
-    from velap.methods.velap import VelapAgent
-
-    check_method(method)
-    stack = config.model.frame_stack
-    if method == "random":
-        return RandomAgent(action_space, stack)
-    if model is None:
-        raise UnknownTaskError(f"method {method!r} acts by a trained model, got none; name one with --checkpoint.")
-    model.eval()
-    settings = settings or method_settings(method, preset=config.preset)
-    if method in HEADS:
-        return _headed_agent(method, model, stack, head, settings)
-    if method == "td3bc":
-        return ReactiveAgent(method, model, model.act_global, stack)
-    if method == "velap":
-        return VelapAgent(model, config)
-    from velap.methods.mpc import MPCAgent
-
-    planner: Any = settings
-    return MPCAgent(model, stack, planner)
-
-
-def _headed_agent(method: str, model: LatentModel, stack: int, head: AnyHead | None, settings: Settings | None) -> Agent:
-    """An agent of a learner; raises ConfigError without the head of that very method."""
-    from velap.methods.iris import IRISAgent
-    from velap.methods.reactive import ReactiveAgent
-
-    if head is None or head.method != method:
-        got = "none" if head is None else f"one of {head.method!r}"
-        raise ConfigError(f"the method {method!r} acts by its own head and got {got}; train it with `velap train TASK "
-                          f"--method {method}`, or name its file with --head.")
-    head.eval()
-    learnt: Any = head
-    if method.startswith("iris"):
-        planner: Any = settings
-        return IRISAgent(method, model, stack, learnt, planner)
-    return ReactiveAgent(method, model, learnt.act, stack)
+    kind = get_method(method)
+    if kind.needs_model:
+        if model is None:
+            raise UnknownTaskError(f"method {method!r} acts by a trained model, got none; name one with --checkpoint.")
+        model.eval()
+    if kind.learns:
+        if head is None or head.method != method:
+            got = "none" if head is None else f"one of {head.method!r}"
+            raise ConfigError(f"the method {method!r} acts by its own head and got {got}; train it with `velap train TASK "
+                              f"--method {method}`, or name its file with --head.")
+        head.eval()
+    settings = settings or kind.settings_of(config.preset)
+    return kind.agent(Parts(model, config, action_space, settings, head))  # type: ignore[arg-type]  # None where not needed
 
 
 def masked_seeds(mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None) -> list[tuple[int, int]]:

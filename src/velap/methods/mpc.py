@@ -5,7 +5,8 @@ B environments, P rows that plan at one step, H horizon [steps], D latent, A act
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -14,11 +15,16 @@ from torch import Tensor
 
 from velap.errors import ConfigError
 from velap.methods.planning import PlanningAgent
-from velap.search.shooting import MBOPConfig, MPPIConfig, Shot, shift_mean, shoot, shoot_mbop
-from velap.search.types import SearchFns
+from velap.search.shooting import ShootingConfig, Shot, shift_mean
+from velap.search.types import RowGenerator, SearchFns
 
 if TYPE_CHECKING:
     from velap.models.velap import LatentModel
+
+
+ConfigT = TypeVar("ConfigT", bound=ShootingConfig)
+Shoot = Callable[[SearchFns, Tensor, ConfigT, RowGenerator, Tensor | None], Shot]
+"""The model, latents [P, D], how to plan, generators, and the shifted means [P, H, A] of the plans before -> new plans."""
 
 
 class MPCAgent(PlanningAgent):
@@ -28,13 +34,13 @@ class MPCAgent(PlanningAgent):
     MBOP mixes with the shifted previous trajectory (Alg. 3). The first plan of an episode starts from zeros.
     """
 
-    def __init__(self, model: LatentModel, frame_stack: int, planner: MPPIConfig | MBOPConfig) -> None:
+    def __init__(self, method: str, model: LatentModel, planner: ConfigT, shoot: Shoot[ConfigT]) -> None:
         if planner.replan_every > planner.horizon:
             raise ConfigError(f"`replan_every` is {planner.replan_every} and `horizon` {planner.horizon} steps; expected a "
                               "plan as long as what is executed of it. Change one of them.")
-        super().__init__(model, frame_stack, planner.replan_every)
-        self.method = "mppi" if isinstance(planner, MPPIConfig) else "mbop"
-        self._planner = planner
+        super().__init__(method, model, planner.replan_every)
+        self._planner: ShootingConfig = planner
+        self._shoot: Shoot[Any] = shoot
         self._fns = SearchFns(**model.search_fns(hidden=planner.arithmetic))
         self._actions = torch.empty(0)
         self._mean = torch.empty(0)
@@ -50,15 +56,9 @@ class MPCAgent(PlanningAgent):
 
     def _plan(self, rows: NDArray[np.int64], latents: Tensor, generators: list[torch.Generator]) -> None:
         index = torch.from_numpy(rows).to(self._device)
-        shot = self._shoot(latents, generators, self._mean[index])
+        shot = self._shoot(self._fns, latents, self._planner, generators, self._mean[index])
         self._actions[index] = shot.actions
         self._mean[index] = shift_mean(shot.mean, self._planner.replan_every)
-
-    def _shoot(self, latents: Tensor, generators: list[torch.Generator], previous: Tensor) -> Shot:
-        """One plan for latents [P, D] from the shifted previous means [P, H, A]."""
-        if isinstance(self._planner, MPPIConfig):
-            return shoot(self._fns, latents, self._planner, generators, previous)
-        return shoot_mbop(self._fns, latents, self._planner, generators, previous)
 
     def _follow(self, latents: Tensor) -> Tensor:
         step = torch.from_numpy(self._age).to(self._device)

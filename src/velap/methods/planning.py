@@ -28,10 +28,9 @@ class PlanningAgent(ABC):
     plan is the same to the last bit whatever rows it shares the batch with. On a GPU all rows due plan at once.
     """
 
-    method: str
-
-    def __init__(self, model: LatentModel, frame_stack: int, period: int) -> None:
-        self.frame_stack = frame_stack
+    def __init__(self, method: str, model: LatentModel, period: int) -> None:
+        self.method = method
+        self.frame_stack = model.config.frame_stack
         self.last_plan_ms: NDArray[np.float64] = np.empty(0)
         self._model, self._states = model, StateEncoder(model)
         self._period = period

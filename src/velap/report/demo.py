@@ -36,7 +36,7 @@ class FirstPlan:
 
     def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
         """Keep the plan once, as soon as it is there."""
-        if self._kept is None and seed == self._seed and isinstance(agent, VelapAgent) and agent.last_plan is not None:
+        if self._kept is None and seed == self._seed and isinstance(agent, VelapAgent) and isinstance(agent.last_plan, Plan):
             rows = np.flatnonzero(agent.last_plan_rows == row)
             if len(rows):
                 self._kept = picture(env, PICTURE), agent.last_plan, int(rows[0])

@@ -89,11 +89,11 @@ class VideoRecorder:
     def _draw_plan(self, image: Image.Image, agent: VelapAgent, row: int) -> str:
         """Draw the waypoints ahead of `row`, the next one in red; returns what the agent does, for the caption."""
         value = agent.last_values[row]
-        waypoints = agent.waypoints_ahead(row).float().cpu().numpy()
-        if agent.led_by_success[row]:
+        waypoints = agent.plans.ahead(row).float().cpu().numpy()
+        if agent.led[row]:
             return f"Q^g {value:.3f}, successes followed"
         if agent.near_goal[row] or len(waypoints) == 0:
-            return f"Q^g {value:.3f}, {agent.leader} acts"
+            return f"Q^g {value:.3f}, {agent.global_policy} acts"
         if self._map is not None:
             points = [tuple(point) for point in to_pixels(self._map.locate(waypoints), self._map.extent, TILE)]
             draw = ImageDraw.Draw(image)

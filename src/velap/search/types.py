@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+
+from velap.config.planning import PlannerConfig
 
 RowGenerator = torch.Generator | Sequence[torch.Generator]
 """One generator for all rows, or one a row: then a row's numbers do not depend on the other rows."""
@@ -86,13 +88,19 @@ class Tree:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The chosen path g* (Eq. 8) of every row, and the tree it was found in."""
+class Path:
+    """The path that every row is to follow."""
 
     waypoints: Tensor
     """[B, L, D] latents, root first, the last one repeated."""
     length: Tensor
     """[B] int64 nodes of the path, the root included: 1 means that there is nowhere to go."""
+
+
+@dataclass(frozen=True)
+class Plan(Path):
+    """The chosen path g* (Eq. 8) of every row, and the tree it was found in."""
+
     cost: Tensor
     """[B] c(g*) [steps]."""
     reached_goal: Tensor
@@ -101,3 +109,11 @@ class Plan:
     """[B, L] int64 slots of the waypoints in the tree."""
     tree: Tree
     rejections: Rejections
+
+
+class Planner(Protocol):
+    """Finds a path from every root; `velap.register_planner` makes one known by name."""
+
+    def __call__(self, fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGenerator) -> Path:
+        """The model, latents [B, D] to plan from, the checkpoint's planner config, and one generator a row."""
+        ...

@@ -21,7 +21,6 @@ from velap.data.frames import FrameStore
 from velap.data.sampling import WindowSampler
 from velap.errors import CheckpointError, ConfigError
 from velap.losses import Info
-from velap.models.heads import AnyHead
 from velap.models.velap import LatentModel, shared_weights
 from velap.runs import load_tensors, make_generator, save_tensors
 from velap.training.capture import adam, set_rate
@@ -147,7 +146,7 @@ def _cached_latents(model: LatentModel, sampler: WindowSampler, identity: dict[s
 
 
 ConfigT = TypeVar("ConfigT", bound=LearnerConfig)
-HeadT = TypeVar("HeadT", bound=AnyHead)
+HeadT = TypeVar("HeadT", bound=nn.Module)
 
 
 class FrozenLearner(ABC, Generic[ConfigT, HeadT]):

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from velap.config.training import TrainConfig
-from velap.data.sampling import Batch, FirstTransitions, WholeWindows, WindowSampler
+from velap.data.sampling import Batch, WindowSampler
 from velap.losses import (
     Info,
     action_model_loss,
@@ -46,26 +46,18 @@ VALUE_BATCH = 512
 """Transitions a batch of the value phase. ours."""
 
 
-def windows_of(config: TrainConfig) -> WholeWindows | FirstTransitions:
-    """What a batch of the joint phase is."""
-    if not config.whole_windows:
-        return FirstTransitions(config.batch_windows, config.window)
-    return WholeWindows(config.batch_windows, config.window, config.value_transitions, config.dynamics_rollouts,
-                        config.dynamics_horizon)
-
-
 def rollouts(model: LatentModel, latents: Tensor, batch: Batch, k: int) -> tuple[Tensor, Tensor, Tensor]:
-    """k-step predictions of h along the data's actions from `batch.unroll_at`: predicted [k, W, D], positions int64 [k, W]
-    of the truth, valid [k, W]. latents [M, D].
+    """k-step predictions of h along the data's actions from `batch.unrolled`: predicted [k, W, D], positions int64 [k, W] of
+    the truth, valid [k, W]. latents [M, D].
     """
     width = batch.valid.shape[1] + 1
-    window, step = batch.unroll_at // width, batch.unroll_at % width
-    latent = latents[batch.unroll_at]
+    window, step = batch.unrolled // width, batch.unrolled % width
+    latent = latents[batch.unrolled]
     predicted, truth, valid = [], [], []
     for i in range(k):
         latent = model.step(latent, batch.actions[window, step + i])
         predicted.append(latent)
-        truth.append(batch.unroll_at + i + 1)
+        truth.append(batch.unrolled + i + 1)
         valid.append(batch.valid[window, step + i])
     return torch.stack(predicted), torch.stack(truth), torch.stack(valid)
 
@@ -166,7 +158,7 @@ class JointLearner:
 
     def _update_jointly(self, policies: bool) -> Info:
         config = self.config
-        batch = self.sampler.sample(windows_of(config), self.generator)
+        batch = self.sampler.sample(config.batch_windows, config.window, config.whole_windows, self.generator)
         self.model_optimizer.zero_grad(set_to_none=True)
         stacks = self.sampler.stacks(batch.rows)
         encoded = self.model.encoder(stacks)
@@ -198,8 +190,7 @@ class JointLearner:
         assert self.cache is not None, "begin_latent_phase comes first"
         config = self.config
         share = config.latent_rewarded_share
-        draw = FirstTransitions(LATENT_BATCH, config.latent_horizon)
-        batch = self.sampler.sample(draw, self.generator, rewarded_share=share)
+        batch = self.sampler.sample(LATENT_BATCH, config.latent_horizon, False, self.generator, rewarded_share=share)
         latents = self.cache[batch.rows]
         self.model_optimizer.zero_grad(set_to_none=True)
         with self._threads(batch):
@@ -216,7 +207,7 @@ class JointLearner:
     def _update_values(self, policies: bool) -> Info:
         assert self.cache is not None, "begin_latent_phase comes first"
         config = self.config
-        batch = self.sampler.sample(FirstTransitions(VALUE_BATCH, config.dynamics_horizon), self.generator,
+        batch = self.sampler.sample(VALUE_BATCH, config.dynamics_horizon, False, self.generator,
                                     rewarded_share=config.latent_rewarded_share)
         latents = self.cache[batch.rows]
         self.model_optimizer.zero_grad(set_to_none=True)
@@ -277,7 +268,7 @@ class JointLearner:
 
     def _threads(self, batch: Batch) -> AbstractContextManager[None]:
         """One thread for the heads while a batch is small."""
-        return one_thread(batch.now_at.device, len(batch.now_at) <= TRANSITIONS_A_THREAD)
+        return one_thread(batch.start.device, len(batch.start) <= TRANSITIONS_A_THREAD)
 
     def start_heads_afresh(self) -> None:
         """New weights for all but the encoder, targets included, before the latent phase (`heads_afresh`)."""
@@ -311,12 +302,12 @@ class JointLearner:
     def value_loss(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
         """1/n Σ L_Q^l + c0 · L_Q^g of Eq. 2, with the targets of Eq. 3 and 4 from the target critics."""
         model, config, weight = self.model, self.config, batch.weight
-        now, goal = latents[batch.now_at], latents[batch.goal_at]
+        now, goal = latents[batch.start], latents[batch.goals.position]
         with torch.no_grad(), evaluated(model.local_policy, model.global_policy):
-            then, there = latents[batch.now_at + 1], goal.detach()
+            then, there = latents[batch.start + 1], goal.detach()
             action = model.act_local(then, there)
             next_local = model.bound(self.local_target(torch.cat([then, there, action], -1))).amin(0)
-            local_goal = td_target(batch.goal_reward, batch.goal_proceeds, next_local, config.discount)
+            local_goal = td_target(batch.goals.reward, batch.goals.proceeds, next_local, config.discount)
             next_global = model.bound(self.global_target(torch.cat([then, model.act_global(then)], -1))).amin(0)
             global_goal = td_target(batch.reward, batch.proceeds, next_global, config.discount)
         local, local_info = critic_error(config.critic_loss)(model.local_q(now, goal, batch.action), local_goal, weight)
@@ -333,7 +324,7 @@ class JointLearner:
     def acting_loss(self, latents: Tensor, batch: Batch) -> tuple[Tensor, Info]:
         """Eq. 5 for both policies, and the β-VAE of g. Only their own parameters are to take its gradient."""
         model, config, weight = self.model, self.config, batch.weight
-        now, goal = latents[batch.now_at], latents[batch.goal_at]
+        now, goal = latents[batch.start], latents[batch.goals.position]
         local_action, global_action = model.act_local(now, goal), model.act_global(now)
         with evaluated(model.local_critics, model.global_critic):
             local_q = model.local_q(now, goal, local_action).amin(0)

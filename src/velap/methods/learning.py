@@ -6,7 +6,6 @@ goes on from. Heads are derived from the joint checkpoint: one that no longer be
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import warnings
 from collections.abc import Callable, Mapping
@@ -18,38 +17,16 @@ import torch
 from torch import Tensor
 
 from velap.data.frames import FrameStore
-from velap.errors import CheckpointError, ConfigError, DatasetError, TrainingError, UnknownTaskError
-from velap.models.heads import AnyHead, head_path, make_head, save_head
+from velap.errors import CheckpointError, DatasetError, TrainingError, UnknownTaskError
+from velap.methods.base import get_method
+from velap.methods.heads import Head, head_path, make_head, save_head
 from velap.models.velap import load_checkpoint, shared_weights
 from velap.runs import MetricsLog, load_tensors, make_generator
 from velap.threads import one_thread
-from velap.training.bc import PAPER_BC, BCConfig, BCLearner, SuccessBCLearner
 from velap.training.frozen import FrozenLearner, LearnerConfig, latent_data
-from velap.training.iql import PAPER_IQL, PAPER_SPARSE_IQL, SPARSE_IQL, IQLConfig, IQLLearner
 from velap.training.loop import pick_device
 from velap.training.state import load_state, save_state
 from velap.training.steps import Cadence, Progress, interrupt_flag, run_steps
-from velap.training.subgoals import MULTISTEP, PAPER_IRIS, PAPER_MULTISTEP, SubgoalConfig, SubgoalLearner
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How the head of a method is learnt."""
-
-    learner: type[FrozenLearner[Any, Any]]
-    default: LearnerConfig
-    paper: LearnerConfig
-
-
-RECIPES: dict[str, Recipe] = {
-    "bc": Recipe(BCLearner, BCConfig(), PAPER_BC),
-    "bc-success": Recipe(SuccessBCLearner, BCConfig(), PAPER_BC),
-    "iql": Recipe(IQLLearner, IQLConfig(), PAPER_IQL),
-    "iql-sparse": Recipe(IQLLearner, SPARSE_IQL, PAPER_SPARSE_IQL),
-    "iris": Recipe(SubgoalLearner, SubgoalConfig(), PAPER_IRIS),
-    "iris-multistep": Recipe(SubgoalLearner, MULTISTEP, PAPER_MULTISTEP),
-}
-"""One recipe for each entry of `velap.models.heads.HEADS`."""
 
 CADENCE = Cadence(log=100, diagnose=1_000, checkpoint=5_000)
 """ours."""
@@ -129,35 +106,11 @@ class HeadRun:
         return self.step
 
 
-JOINT_METHODS = ("velap", "td3bc", "mppi", "mbop")
-"""Methods that act by the joint checkpoint and learn nothing more."""
-
-
 def check_trainable(method: str) -> None:
     """Raises UnknownTaskError unless there is something to train for that method."""
-    known = (*JOINT_METHODS, *RECIPES)
-    if method not in known:
-        raise UnknownTaskError(f"cannot train the method {method!r}; expected one of {', '.join(known)}. `random` has "
-                               "nothing to learn.")
-
-
-def recipe_of(method: str) -> Recipe:
-    """The recipe of that method; raises UnknownTaskError for a method without a learner of its own."""
-    if method not in RECIPES:
-        raise UnknownTaskError(f"the method {method!r} has no learner of its own; expected one of {', '.join(RECIPES)}. The "
-                               "others act by the joint checkpoint alone: `velap train TASK`.")
-    return RECIPES[method]
-
-
-def learner_config(method: str, preset: str, changes: Mapping[str, Any] | None = None) -> LearnerConfig:
-    """Config of a method's learner in a preset, with the fields of `changes` replaced."""
-    recipe = recipe_of(method)
-    config = recipe.paper if preset == "paper" else recipe.default
-    names = [field.name for field in dataclasses.fields(config)]
-    unknown = sorted(set(changes or {}) - set(names))
-    if unknown:
-        raise ConfigError(f"the learner of {method!r} has no field {unknown}; expected some of {names}.")
-    return dataclasses.replace(config, **(changes or {}))
+    if not get_method(method).needs_model:
+        raise UnknownTaskError(f"cannot train the method {method!r}: it has nothing to learn; expected one that acts by a "
+                               "trained model.")
 
 
 def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path | None = None, *, seed: int | None = None,
@@ -168,7 +121,7 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
     Ctrl-C saves the state and raises KeyboardInterrupt; the same call goes on from there, to the same bits on a CPU.
 
     Args:
-        method: one of `velap.models.heads.HEADS`.
+        method: a registered method with a head.
         checkpoint: `model.safetensors` of the joint training.
         store: the dataset that the checkpoint was trained on.
         out: the head's file; None takes `<method>.safetensors` beside the checkpoint.
@@ -179,10 +132,12 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
         command: kept in the head as its origin.
         on_progress: called after every logged step.
     """
-    recipe_of(method)
+    kind = get_method(method)
+    if kind.learner is None:
+        raise kind.nothing_to_learn()
     checkpoint, place = Path(checkpoint), pick_device(device)
     model, joint, metadata = load_checkpoint(checkpoint, place)
-    config = config or learner_config(method, joint.preset, {} if steps is None else {"steps": steps})
+    config = config or kind.learner_config(joint.preset, {} if steps is None else {"steps": steps})
     trained_on = metadata.get("dataset_hash", store.content_hash)
     if trained_on != store.content_hash:
         raise DatasetError(f"{checkpoint} was trained on a dataset with hash {trained_on[:12]}, {store.dataset_id} has "
@@ -200,7 +155,7 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
         head = make_head(method, joint.model, model.action_dim).to(place).train()
     head.settings = config.to_json()
     data = latent_data(model, joint, metadata, store, checkpoint.parent)
-    learner = recipe_of(method).learner(head, data, config, make_generator(seed, stream=3, device=place))
+    learner = kind.learner(head, data, config, make_generator(seed, stream=3, device=place))
     run = HeadRun(learner, path, identity)
     _run(run, on_progress)
     return _finish(run, head, metadata, {"command": command, "dataset_id": store.dataset_id})
@@ -241,7 +196,7 @@ def _run(run: HeadRun, on_progress: Callable[[Progress], None]) -> None:
         raise KeyboardInterrupt
 
 
-def _finish(run: HeadRun, head: AnyHead, joint_metadata: dict[str, str], origin: dict[str, str]) -> HeadResult:
+def _finish(run: HeadRun, head: Head, joint_metadata: dict[str, str], origin: dict[str, str]) -> HeadResult:
     """Write the head and drop the state."""
     broken = sorted(name for name, value in head.state_dict().items() if not bool(torch.isfinite(value).all()))
     if broken:

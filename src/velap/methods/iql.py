@@ -14,8 +14,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from velap.config import ModelConfig
 from velap.losses import Info, cloning_error, polyak, td_target
-from velap.models.heads import IQLHead
+from velap.methods.base import Agent, Method, Parts
+from velap.methods.heads import PolicyHead
+from velap.methods.reactive import ReactiveAgent
+from velap.models.networks import MLP, EnsembleMLP
+from velap.registry import register_method
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
 from velap.training.latents import evaluated
 from velap.training.steps import cosine
@@ -62,6 +67,26 @@ SPARSE_IQL = IQLConfig(expectile=0.9, inverse_temperature=10.0, reward_shift=-1.
 """The setting of IQL's authors for sparse rewards (AntMaze), with the default preset's length and sampling."""
 PAPER_SPARSE_IQL = dataclasses.replace(PAPER_IQL, expectile=0.9, inverse_temperature=10.0, reward_shift=-1.0)
 """The same with D.3's length."""
+
+N_CRITICS = 2
+"""Q-networks, of which the minimum counts (Kostrikov et al. 2022, as in TD3)."""
+
+
+class IQLHead(PolicyHead):
+    """The policy of Table 5 beside the critics Q and V of Table 6."""
+
+    def __init__(self, config: ModelConfig, action_dim: int) -> None:
+        super().__init__(config, action_dim)
+        self.critics = EnsembleMLP(N_CRITICS, config.width(action_dim) + action_dim, config.critic_dense, config.norm)
+        self.value_net = MLP(config.width(action_dim), config.critic_dense, 1, config.norm)
+
+    def qs(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Q of every critic: `[*, D], [*, A] → [n, *]` [Q-value, in units of the learner's reward]."""
+        return self.critics(torch.cat([latent, action], -1))
+
+    def value(self, latent: Tensor) -> Tensor:
+        """V: `[*, D] → [*]` [Q-value, in units of the learner's reward]."""
+        return self.value_net(latent).squeeze(-1)
 
 
 def expectile_loss(value: Tensor, target: Tensor, expectile: float) -> Tensor:
@@ -136,3 +161,24 @@ class IQLLearner(FrozenLearner[IQLConfig, IQLHead]):
         polyak(target, source, self.config.target_rate)
         for old, new in zip(target_buffers, source_buffers, strict=True):
             old.copy_(new)
+
+
+@register_method("iql")
+class IQL(Method):
+    """IQL with D.3's τ and β."""
+
+    label = "IQL"
+    head, learner = IQLHead, IQLLearner
+    learning, paper_learning = IQLConfig(), PAPER_IQL
+
+    def agent(self, parts: Parts) -> Agent:
+        """The policy at every step."""
+        return ReactiveAgent(self.name, parts.model, parts.head.act)
+
+
+@register_method("iql-sparse")
+class SparseIQL(IQL):
+    """IQL as its authors set it for sparse rewards."""
+
+    label = "IQL (0.9 / 10)"
+    learning, paper_learning = SPARSE_IQL, PAPER_SPARSE_IQL

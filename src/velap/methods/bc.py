@@ -12,7 +12,10 @@ from torch import Tensor
 
 from velap.errors import DatasetError
 from velap.losses import Info, cloning_error
-from velap.models.heads import PolicyHead
+from velap.methods.base import Agent, Method, Parts
+from velap.methods.heads import PolicyHead
+from velap.methods.reactive import ReactiveAgent
+from velap.registry import register_method
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
 
 
@@ -60,3 +63,24 @@ class SuccessBCLearner(BCLearner):
             raise DatasetError(f"{data.dataset_id} has no successful episode; BC(D*) learns from those alone and expects at "
                                "least one with a reward of 1. Collect or label some successes, or use `--method bc`.")
         self.pool, self.held_out = data.success_training, data.success_held_out
+
+
+@register_method("bc")
+class BC(Method):
+    """BC on all transitions."""
+
+    label = "BC"
+    head, learner = PolicyHead, BCLearner
+    learning, paper_learning = BCConfig(), PAPER_BC
+
+    def agent(self, parts: Parts) -> Agent:
+        """The cloned policy at every step."""
+        return ReactiveAgent(self.name, parts.model, parts.head.act)
+
+
+@register_method("bc-success")
+class SuccessBC(BC):
+    """BC(D*)."""
+
+    label = "BC (D*)"
+    learner = SuccessBCLearner

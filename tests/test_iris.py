@@ -9,10 +9,16 @@ import torch
 
 from latent_data import SMALL, corridor
 from velap.errors import ConfigError
-from velap.models.heads import SubgoalHead
+from velap.methods.iris import (
+    MULTISTEP_SUBGOALS,
+    PAPER_SUBGOALS,
+    SubgoalConfig,
+    SubgoalHead,
+    SubgoalLearner,
+    future_rows,
+)
 from velap.runs import make_generator
 from velap.training.frozen import LatentData
-from velap.training.subgoals import MULTISTEP, PAPER_IRIS, SubgoalConfig, SubgoalLearner, future_rows
 
 
 def walks(length: int = 12, copies: int = 60) -> LatentData:
@@ -102,7 +108,7 @@ def test_iris_learns_both_ways_out_and_how_to_go_there() -> None:
 
 
 def test_the_multistep_variant_is_appendix_d7() -> None:
-    assert MULTISTEP.horizon == 5
-    assert (PAPER_IRIS.steps, PAPER_IRIS.batch, PAPER_IRIS.learning_rate) == (300_000, 128, 3e-4)
+    assert MULTISTEP_SUBGOALS.horizon == 5
+    assert (PAPER_SUBGOALS.steps, PAPER_SUBGOALS.batch, PAPER_SUBGOALS.learning_rate) == (300_000, 128, 3e-4)
     with pytest.raises(ConfigError, match="SubgoalConfig field `horizon` is 0; expected at least 1 step"):
         SubgoalConfig(horizon=0)

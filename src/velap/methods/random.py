@@ -1,0 +1,59 @@
+"""Uniform actions: what a task gives to who knows nothing. ours: Table 1 has no such row.
+
+B environments, N stacked frames, A action dimension.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velap.methods.base import Agent, Method, Parts, masked_seeds
+from velap.methods.states import checked_frames
+from velap.registry import register_method
+
+if TYPE_CHECKING:
+    from gymnasium.spaces import Box
+
+
+class RandomAgent:
+    """Uniform actions over the action space, from one generator a row."""
+
+    method = "random"
+
+    def __init__(self, action_space: Box, frame_stack: int) -> None:
+        self.frame_stack = frame_stack
+        self.last_plan_ms: NDArray[np.float64] = np.empty(0)
+        self._low = action_space.low.astype(np.float32)
+        self._high = action_space.high.astype(np.float32)
+        self._generators: list[np.random.Generator] = []
+
+    def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
+        """New generators where `mask` [B] is set."""
+        if len(self._generators) != len(mask):
+            self._generators = [np.random.default_rng(row) for row in range(len(mask))]
+            self.last_plan_ms = np.full(len(mask), np.nan)
+        for row, seed in masked_seeds(mask, seeds):
+            self._generators[row] = np.random.default_rng(seed)
+
+    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Uniform actions [B, A]; of the frames [B, N, H, W, 3] only the number counts, H and W are any."""
+        frames = checked_frames(frames, self.frame_stack)
+        if len(frames) != len(self._generators):
+            self.reset(np.ones(len(frames), bool))
+        draws = [generator.uniform(self._low, self._high) for generator in self._generators]
+        return np.stack(draws).astype(np.float32)
+
+
+@register_method("random")
+class Random(Method):
+    """Uniform actions."""
+
+    label = "random"
+    needs_model = False
+
+    def agent(self, parts: Parts) -> Agent:
+        """Acts without a model; the frames are stacked as for one, and not looked at."""
+        return RandomAgent(parts.action_space, parts.config.model.frame_stack)
