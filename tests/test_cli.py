@@ -58,6 +58,7 @@ def untrained(path: Path, task: str = "SpiralMaze", side: int = 64, bound: float
     (["train", "SpiralMaze", "--set", "n_iter=3"], "expected PART.FIELD=VALUE"),
     (["train", "SpiralMaze", "--set", "train.nothing=3"], "no field ['nothing']"),
     (["train", "SpiralMaze", "--set", "train.window=x"], "'x' for train.window; expected int"),
+    (["evaluate", "SpiralMaze", "--method", "ppo"], "unknown method 'ppo'; expected one of bc, "),
     (["table"], "no records below"),
     (["table", "--records", "x", "--write", "README.md"], "no records below"),
 ])
@@ -73,7 +74,7 @@ def test_errors_are_one_paragraph_and_exit_2(arguments: list[str], text: str, ca
 
 @pytest.mark.parametrize("arguments", [
     [], ["fly"], ["train", "SpiralMaze", "--sede", "1"], ["train", "SpiralMaze", "--preset", "best"],
-    ["evaluate", "SpiralMaze", "--method", "ppo"], ["evaluate", "SpiralMaze", "--episodes", "many"], ["evaluate"],
+    ["evaluate", "SpiralMaze", "--episodes", "many"], ["evaluate"],
 ])
 def test_wrong_options_exit_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
