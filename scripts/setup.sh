@@ -53,6 +53,8 @@ say "Python packages (PyTorch is large, this can take minutes)"
 export PIP_DISABLE_PIP_VERSION_CHECK=1
 .venv/bin/python -m pip install --quiet torch==2.13.0
 .venv/bin/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+# openpi-client asks for NumPy 1 and needs none of its other packages: the tests of `velap serve` take it as it is.
+.venv/bin/python -m pip install --quiet --no-deps openpi-client==0.1.2
 
 # The real thing is drawn: libraries that are there and do not work count as missing.
 draws() { .venv/bin/python -c 'import gymnasium, velap.envs; gymnasium.make("velap/SpiralMaze-v0").reset(seed=0)'; }

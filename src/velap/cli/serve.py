@@ -1,0 +1,47 @@
+"""`velap serve` and `velap export`."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from velap.errors import ConfigError
+
+Checkpoint = Annotated[Positional[Path], arg(help="`model.safetensors` of a run.")]
+Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="`auto` takes CUDA where there is one.")]
+KEY = "VELAP_API_KEY"
+"""Environment variable with the key: on the command line every user of the machine could read it."""
+
+
+def serve(checkpoint: Checkpoint, method: str = "velap", host: str = "127.0.0.1", port: int = 8000,
+          image_key: str | None = None, device: Device = "auto", head: Path | None = None) -> None:
+    """Serve a checkpoint to robots by openpi's websocket protocol, for `openpi-client`; see docs/howto/real-robot.md.
+
+    Clients send the key that the environment variable VELAP_API_KEY holds here.
+
+    Args:
+        method: VELAP or another method of `velap evaluate`.
+        host: Address to listen on; one that other machines reach needs a key.
+        port: Port to listen on.
+        image_key: Key of the camera's picture in observations, `a/b` when nested; the only picture unless said.
+        head: What the method learnt; METHOD.safetensors beside the checkpoint unless said.
+    """
+    try:
+        from velap.serve.server import Server
+    except ImportError as error:
+        raise ConfigError(f"{error}; expected the packages of the server. Install them by `pip install 'velap[serve]'`."
+                          ) from error
+    from velap.cli import OUT
+    from velap.serve.session import load_policy
+
+    logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
+    policy = load_policy(checkpoint, method, device, head)
+    server = Server(policy, host=host, port=port, api_key=os.environ.get(KEY), image_key=image_key)
+    keyed = "clients need the key" if KEY in os.environ else f"without a key: {KEY} is not set"
+    asyncio.run(server.run(lambda at: OUT.print(
+        f"serving {checkpoint} ({method}) on ws://{host}:{at}, {keyed}; Ctrl-C ends it", markup=False, soft_wrap=True)))
