@@ -23,7 +23,7 @@ from toy_world import (
     toy_fns,
 )
 from velap.config.planning import PlannerConfig
-from velap.search import expansion
+from velap.search import neighbours
 from velap.search.est import plan
 from velap.search.sampling import draw_noise
 from velap.search.types import Plan
@@ -35,7 +35,7 @@ CONFIG = PlannerConfig(n_iter=250, n_sim=5, candidates=25, discard_low_exponent=
 def compare_with_every_node() -> Iterator[None]:
     """As the paper does: with no more than MAX_NEIGHBOURS inside d_neigh that makes no difference, here there are more."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(expansion, "MAX_NEIGHBOURS", 1000)
+        patch.setattr(neighbours, "MAX_NEIGHBOURS", 1000)
         yield
 
 

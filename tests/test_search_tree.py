@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from toy_world import DISCOUNT, reach, roots, row_generators, toy_fns
 from velap.config.planning import PlannerConfig
-from velap.search import expansion
+from velap.search import neighbours
 from velap.search.est import plan
 from velap.search.tree import Candidates, free_slots, insert_, new_tree, take, trace_back, trimmed
 
@@ -69,7 +69,7 @@ def test_take_gathers_rows_of_each_batch() -> None:
 def compare_with_every_node() -> Iterator[None]:
     """As the paper does: with no more than MAX_NEIGHBOURS inside d_neigh that makes no difference, here there are more."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(expansion, "MAX_NEIGHBOURS", 1000)
+        patch.setattr(neighbours, "MAX_NEIGHBOURS", 1000)
         yield
 
 

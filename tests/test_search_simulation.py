@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from toy_world import DISCOUNT, SPEED, reach, roots, row_generators, toy_fns
 from velap.config.planning import PlannerConfig
 from velap.errors import ConfigError
-from velap.search import est, expansion
-from velap.search.est import plan
-from velap.search.expansion import expand_, first_come, simulate, thresholds
+from velap.search import est, neighbours, simulation
+from velap.search.est import expand_, plan, thresholds
+from velap.search.neighbours import first_come
 from velap.search.sampling import Noise, draw_noise
+from velap.search.simulation import simulate
 from velap.search.tree import new_tree, trimmed
 
 CONFIG = PlannerConfig(n_iter=100, n_sim=5, candidates=25, discard_low_exponent=6.0)
@@ -107,7 +108,7 @@ def test_candidates_of_one_round_are_novel_against_each_other() -> None:
 def test_only_the_nearest_neighbours_are_compared_with(monkeypatch: pytest.MonkeyPatch) -> None:
     cfg = PlannerConfig(n_iter=100, candidates=1, n_sim=5, discard_low_exponent=6.0, p_sparse=0.0)
     full = plan(toy_fns(), roots(1), cfg, row_generators(1)).tree
-    monkeypatch.setattr(expansion, "MAX_NEIGHBOURS", 1)
+    monkeypatch.setattr(neighbours, "MAX_NEIGHBOURS", 1)
     few = plan(toy_fns(), roots(1), cfg, row_generators(1)).tree
     assert full.latents[0].tolist() == few.latents[0].tolist(), "in a metric world the nearest node decides about novelty"
     assert few.neighbour_counts.sum() < full.neighbour_counts.sum()
@@ -146,7 +147,7 @@ def accept_all(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor, to
 def test_packing_changes_no_result(monkeypatch: pytest.MonkeyPatch, reach_fn: Callable[..., Any]) -> None:
     cfg, fns = PlannerConfig(**{**CONFIG.__dict__, "candidates": 10}), toy_fns(reach=reach_fn)
     packed = plan(fns, roots(3, spread=2.0), cfg, row_generators(3))
-    for module in (expansion, est):
+    for module in (neighbours, simulation, est):
         monkeypatch.setattr(module, "packs", lambda z: False)
     whole = plan(fns, roots(3, spread=2.0), cfg, row_generators(3))
     assert (packed.tree.size == 101).all() == (reach_fn is accept_all)
