@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 from tyro.conf import Positional, UseAppendAction, arg
 
-from velap.cli.serve import serve
+from velap.cli.serve import export, serve
 from velap.cli.settings import parse_settings
 from velap.errors import ConfigError, VelapError
 from velap.storage import OWN_RECORDS, SHIPPED_RECORDS
@@ -362,7 +362,7 @@ def info() -> None:
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": demo, "collect": collect, "train": train, "evaluate": evaluate, "run": run, "table": table, "bench": bench,
-    "diagnose": diagnose, "study": study, "figure": figure, "info": info, "serve": serve,
+    "diagnose": diagnose, "study": study, "figure": figure, "info": info, "serve": serve, "export": export,
 }
 
 

@@ -45,3 +45,18 @@ def serve(checkpoint: Checkpoint, method: str = "velap", host: str = "127.0.0.1"
     keyed = "clients need the key" if KEY in os.environ else f"without a key: {KEY} is not set"
     asyncio.run(server.run(lambda at: OUT.print(
         f"serving {checkpoint} ({method}) on ws://{host}:{at}, {keyed}; Ctrl-C ends it", markup=False, soft_wrap=True)))
+
+
+def export(checkpoint: Checkpoint, out: Path = Path("exported"), tolerance: float = 1e-4) -> None:
+    """Export encoder and policies as programs that run without velap, after comparing them with the model.
+
+    Args:
+        out: New folder that the programs go to.
+        tolerance: Largest difference from the model's output that is let pass.
+    """
+    from velap.cli import OUT
+    from velap.serve.export import export as run
+
+    for name, program in run(checkpoint, out, tolerance).items():
+        OUT.print(f"{out / program.file}: {name}({', '.join(program.inputs)}) -> {program.output}; "
+                  f"at most {program.max_difference:.1g} from the model", markup=False, soft_wrap=True)
