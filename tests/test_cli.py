@@ -90,7 +90,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     assert all(f"• {name}" in text for name in cli.COMMANDS)
     assert set(cli.COMMANDS) == {"demo", "collect", "train", "evaluate", "run", "table", "bench", "diagnose", "study",
-                                 "figure", "info"}
+                                 "figure", "info", "serve", "export"}
 
 
 def test_ctrl_c_exits_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
