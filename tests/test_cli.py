@@ -137,11 +137,12 @@ def test_an_evaluation_goes_on_where_it_stopped(capsys: pytest.CaptureFixture[st
     assert {record.episode_seed for record in read_records(path)} == {0, 1, 2}
 
 
-def test_a_table_is_written_into_the_readme(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_is_written_into_a_document(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*RANDOM, "--episodes", "1"]) == 0
-    Path("README.md").write_text((ROOT / "README.md").read_text())
-    assert cli.main(["table", "--write", "README.md"]) == 0
-    assert "| SpiralMaze | random | default | 0 | 1 | 0.0 (0.0 to 79.3) | - / 4.0 | - / - |" in Path("README.md").read_text()
+    Path("records.md").write_text((ROOT / "docs/records.md").read_text())
+    assert cli.main(["table", "--write", "records.md"]) == 0
+    row = "| SpiralMaze | random | default | 0 | 1 | 0.0 (0.0 to 79.3) | - / 4.0 | - / - |"
+    assert row in Path("records.md").read_text()
     assert cli.main(["table"]) == 0
     assert "SpiralMaze" in capsys.readouterr().out
 

@@ -135,7 +135,7 @@ def test_the_red_wall_and_the_bars_are_in_the_frame(maze):
 
 
 def test_random_walks_succeed_in_about_0_11_percent_of_transitions(maze):
-    """A quarter of Table 10's recipe, without frames; the mean of seven seeds is 0.117, see docs/decisions.md.
+    """A quarter of Table 10's recipe, without frames; the mean of seven seeds is 0.117, see ADR 4.
 
     Starts too far from the goal for 20 steps cannot succeed and are not run.
     """

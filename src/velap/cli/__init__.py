@@ -211,7 +211,8 @@ def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make
     Args:
         records: Root of the episode records; runs/records unless said, with `1` those of the published tables in
             results/records.
-        write: Document to update: README.md with its table marks; with `1` docs/results.md, or another one to write.
+        write: Document to update between its table marks, such as docs/records.md; with `1` docs/results.md, or another
+            one to write.
         only: Cells to run, such as `task=SpiralMaze method=bc,iql`. Axes are task, method, preset and seed; unless said all
             tasks, all methods, preset=default and seed=0.
         jobs: Jobs at once, on one machine; each gets its share of the cores.

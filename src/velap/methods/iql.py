@@ -31,7 +31,7 @@ class IQLConfig(LearnerConfig):
     """D.3, and where it is silent the authors' code."""
 
     steps: int = 15_000
-    """Updates. D.3: 3·10⁵. ours: see docs/decisions.md."""
+    """Updates. D.3: 3·10⁵. ours: see docs/experiments/2026-11-heads.md."""
     learning_rate: float = 3e-4
     """D.3."""
     cosine: bool = False

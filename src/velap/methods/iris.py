@@ -40,12 +40,12 @@ class SubgoalConfig(LearnerConfig):
     """IRIS. Learning rate, batch and length follow D.1 in `paper`; D.6 gives none."""
 
     steps: int = 10_000
-    """Updates. ours: see docs/decisions.md; 3·10⁵ in `paper`."""
+    """Updates. ours: see docs/experiments/2026-11-heads.md; 3·10⁵ in `paper`."""
     horizon: int = 10
     """n, how far ahead a subgoal lies [steps]. D.7: 5 for the multi-step variant. ours: 10 for IRIS, the default of its
     authors' code (robomimic)."""
     kl_weight: float = 1.0
-    """β of the cVAE. ours: Table 4's 0.01 is for actions; on latents it leaves holes in the prior (docs/decisions.md)."""
+    """β of the cVAE. ours: Table 4's 0.01 is for actions; on latents it leaves holes in the prior (ADR 57)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -38,7 +38,7 @@ class LearnerConfig:
     """What every learner on frozen latents has. The defaults are the default preset's."""
 
     steps: int = 20_000
-    """Updates at most. D.1 and D.3: 3·10⁵. ours: docs/decisions.md has the held-out curves."""
+    """Updates at most. D.1 and D.3: 3·10⁵. ours: docs/experiments/2026-11-heads.md has the held-out curves."""
     batch: int = 256
     """Transitions a batch. D.1: 128; D.3: 256."""
     learning_rate: float = 1e-3
