@@ -177,3 +177,27 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
                          capture_output=True, text=True, check=False, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"})
     assert run.returncode == 0, run.stderr
     assert (tmp_path / "equations/index.html").exists()
+
+
+ADRS = sorted((DOCS / "adr").glob("0*.md"))
+
+
+@pytest.mark.parametrize("page", ADRS, ids=lambda page: page.stem)
+def test_a_decision_has_its_parts_and_a_row_in_the_index(page: Path) -> None:
+    text = page.read_text()
+    number, title = re.match(r"# (\d+)\. (.+)\n", text).groups()  # type: ignore[union-attr]  # no match is a failure
+    status = re.search(r"^- Status: (.+)$", text, re.MULTILINE)
+    assert status is not None
+    assert re.match(r"(Accepted|Rejected|Superseded by \[)", status[1]), f"unknown status {status[1]!r}"
+    assert re.search(r"^- Recorded: \d{4}-\d\d-\d\d, `[0-9a-f]{7}`$", text, re.MULTILINE)
+    for part in ("Context", "Decision", "Evidence"):
+        assert re.search(rf"^## {part}\n\n\S", text, re.MULTILINE), f"no {part.lower()}"
+    row = f"| {number} | [{title}]({page.name}) | {status[1]} |"
+    assert row in (DOCS / "adr/index.md").read_text()
+    assert int(number) == int(page.stem[:4])
+
+
+def test_experiments_are_in_their_index() -> None:
+    index = (DOCS / "experiments/index.md").read_text()
+    for page in (DOCS / "experiments").glob("2*.md"):
+        assert f"({page.name})" in index, f"{page.name} is not in docs/experiments/index.md"
