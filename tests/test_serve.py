@@ -12,6 +12,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,18 @@ def test_openpi_client_meets_the_protocol(policy: Policy) -> None:
             client.infer({"left": picture(0), "right": picture(0)})
         assert "Traceback" not in str(caught.value)
         client.infer({"observation/image": picture(2)})  # the connection goes on
+
+
+def test_the_code_of_the_how_to_moves_a_robot(checkpoint: Path, policy: Policy) -> None:
+    pytest.importorskip("openpi_client")
+    page = (ROOT / "docs" / "how-to" / "real-robot.md").read_text()
+    code = page.split("```python\n")[1].split("```")[0]
+    taken: list[np.ndarray] = []
+    camera, robot = SimpleNamespace(read=lambda: picture(len(taken))), SimpleNamespace(move=taken.append)
+    with served(policy) as port:
+        assert "8000" in code and "range(200)" in code
+        exec(code.replace("8000", str(port)).replace("range(200)", "range(6)"), {"camera": camera, "robot": robot})
+    np.testing.assert_allclose(taken, expected_actions(checkpoint, list(range(6))), atol=1e-6)
 
 
 @pytest.mark.parametrize("method", ["velap", "td3bc", "random"])
@@ -298,6 +311,13 @@ def test_a_message_beyond_the_limit_ends_its_connection_alone(policy: Policy) ->
             with pytest.raises(ConnectionClosed) as caught:
                 client.recv(10)
             assert caught.value.rcvd is not None and caught.value.rcvd.code == 1009
+        assert ask(good, {"image": picture(0)}).shape == (1, 3)
+
+
+def test_a_message_in_endless_pieces_ends_its_connection_alone(policy: Policy) -> None:
+    with served(policy) as port, client_of(port) as good:
+        with client_of(port) as client, pytest.raises(ConnectionClosed):
+            client.send(b"" for _ in range(1_000_000))
         assert ask(good, {"image": picture(0)}).shape == (1, 3)
 
 

@@ -20,7 +20,7 @@ KEY = "VELAP_API_KEY"
 
 def serve(checkpoint: Checkpoint, method: str = "velap", host: str = "127.0.0.1", port: int = 8000,
           image_key: str | None = None, device: Device = "auto", head: Path | None = None) -> None:
-    """Serve a checkpoint to robots by openpi's websocket protocol, for `openpi-client`; see docs/howto/real-robot.md.
+    """Serve a checkpoint to robots by openpi's websocket protocol, for `openpi-client`; see docs/how-to/real-robot.md.
 
     Clients send the key that the environment variable VELAP_API_KEY holds here.
 
