@@ -26,7 +26,9 @@ from torch import Tensor
 
 from velap.config import ModelConfig, override
 from velap.config.planning import PlannerConfig
-from velap.data.frames import FrameStore, load_store, make_store, write_dataset
+from velap.data.frames import FrameStore
+from velap.data.loading import load_store
+from velap.data.writing import write_dataset
 from velap.errors import CheckpointError, VelapError
 from velap.methods.mppi import MPPIConfig, shoot
 from velap.models.velap import LatentModel, Spaces, load_checkpoint
@@ -88,8 +90,9 @@ def synthetic_store(trajectories: int | None = None) -> FrameStore:
     rewarded = end & (np.arange(len(frames)) // (steps + 1) % 40 == 0)
     actions = rng.uniform(-1, 1, (len(frames), 2)).astype(np.float32)
     actions[last] = 0
-    return make_store(frames, actions, rewarded.astype(np.float32), rewarded, end & ~rewarded, np.full(episodes, steps),
-                      np.full(2, -1.0), np.full(2, 1.0), DATASET)
+    return FrameStore.from_arrays(frames=frames, actions=actions, rewards=rewarded.astype(np.float32), terminated=rewarded,
+                                  truncated=end & ~rewarded, episode_length=np.full(episodes, steps),
+                                  action_low=np.full(2, -1.0), action_high=np.full(2, 1.0), dataset_id=DATASET)
 
 
 def train_frames_per_s(device: torch.device) -> Measurement:

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from velap.config import Config, override
 from velap.data.behaviours import mixture, run_trajectory
-from velap.data.frames import FrameStore, make_store
+from velap.data.frames import FrameStore
 from velap.data.sampling import WindowSampler
 from velap.errors import ConfigError
 from velap.evaluation.console import View
@@ -94,8 +94,10 @@ def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view:
     number = np.arange(len(rows["rewards"]))
     frames = np.stack([number >> 16, number >> 8 & 255, number & 255], -1).astype(np.uint8).reshape(-1, 1, 1, 3)
     space = env.action_space
-    store = make_store(frames, rows["actions"], rows["rewards"], rows["terminated"], rows["truncated"], rows["length"],
-                       space.low, space.high, f"{task.name}/states")
+    store = FrameStore.from_arrays(frames=frames, actions=rows["actions"], rewards=rows["rewards"],
+                                   terminated=rows["terminated"], truncated=rows["truncated"],
+                                   episode_length=rows["length"], action_low=space.low, action_high=space.high,
+                                   dataset_id=f"{task.name}/states")
     return States(store, rows["frames"].astype(np.float32), len(env.joints))
 
 

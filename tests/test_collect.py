@@ -20,7 +20,9 @@ from velap import threads
 from velap.data import behaviours, minari_io
 from velap.data import card as cards
 from velap.data import collection as collect
-from velap.data.frames import FrameStore, load_positions, load_store
+from velap.data.frames import FrameStore
+from velap.data.loading import load_store
+from velap.data.minari_io import load_positions
 from velap.data.worker import Shard, Workers
 from velap.errors import DatasetError, RenderError, StorageError, UnknownTaskError
 from velap.tasks import Recipe, Task

@@ -16,8 +16,8 @@ from gymnasium.utils.env_checker import check_env
 import velap.envs  # noqa: F401 - registers the tasks
 from velap.data import behaviours, worker
 from velap.data import collection as collect
-from velap.data.frames import load_positions, load_store
-from velap.data.minari_io import open_dataset
+from velap.data.loading import load_store
+from velap.data.minari_io import load_positions, open_dataset
 from velap.evaluation.experts import episode, uniform
 from velap.tasks import TASKS, Recipe
 

@@ -19,8 +19,9 @@ from toy_world import GOAL, START, toy_fns
 from velap import cli
 from velap.config import ModelConfig
 from velap.config.training import TrainConfig
-from velap.data.frames import Extras, FrameStore, make_store, write_dataset
+from velap.data.frames import FrameStore
 from velap.data.sampling import WindowSampler
+from velap.data.writing import Extras, write_dataset
 from velap.envs.mazes.env import STEP_LENGTH, SpiralMaze
 from velap.envs.sawyer.tasks import DrawerButton
 from velap.evaluation.rollout import FrameReader
@@ -81,8 +82,10 @@ def line_store(episodes: int = 8, length: int = 20, side: int = 4) -> FrameStore
     rewards[ends[-1]], terminated[ends[-1]], truncated[ends[:-1]] = 1, True, True
     actions = np.ones((rows, 1))
     actions[length :: length + 1] = 0
-    return make_store(frames, actions, rewards, terminated, truncated, np.full(episodes, length), np.array([-1.0]),
-                      np.array([1.0]), "test/line-v0")
+    return FrameStore.from_arrays(frames=frames, actions=actions, rewards=rewards, terminated=terminated,
+    truncated=truncated,
+                                  episode_length=np.full(episodes, length), action_low=[-1.0], action_high=[1.0],
+                                  dataset_id="test/line-v0")
 
 
 def line_recorded(looked_at: list[int]) -> Recorded:
@@ -152,8 +155,8 @@ def test_promises_of_actions_are_compared_with_what_comes_of_them() -> None:
     truncated = np.isin(np.arange(rows), ends - 1)
     rewards, never = np.zeros(rows), np.zeros(rows, bool)
     actions = np.concatenate([[*walk, 0] for walk in walks])[:, None].astype(float)
-    store = make_store(frames, actions, rewards, never, truncated, np.array([len(walk) for walk in walks]),
-                       np.array([-1.0]), np.array([1.0]), "test/walks-v0")
+    store = FrameStore.from_arrays(frames=frames, actions=actions, rewards=rewards, terminated=never, truncated=truncated,
+                                   episode_length=[len(walk) for walk in walks], action_low=[-1.0], action_high=[1.0])
     sampler = WindowSampler(store, TrainConfig(), 1, torch.device("cpu"), np.arange(3))
     recorded = Recorded(store, sampler, np.arange(3), True, None)
     model: Any = ClimbingModel()
@@ -329,8 +332,11 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
     store, bounds = line_store(episodes=12, side=64), np.ones(2, np.float32)
     positions = store.frames[:, 0, 0, :2].astype(np.float32)
-    write_dataset(make_store(store.frames, store.actions.repeat(2, 1), store.rewards, store.terminated, store.truncated,
-                             store.episode_length, -bounds, bounds, "test/small-v0"), Extras(positions=positions))
+    small = FrameStore.from_arrays(frames=store.frames, actions=store.actions.repeat(2, 1), rewards=store.rewards,
+                                   terminated=store.terminated, truncated=store.truncated,
+                                   episode_length=store.episode_length, action_low=-bounds, action_high=bounds,
+                                   dataset_id="test/small-v0")
+    write_dataset(small, Extras(positions=positions))
     return "test/small-v0"
 
 

@@ -14,16 +14,10 @@ import torch
 from minari.data_collector.episode_buffer import EpisodeBuffer
 
 from velap.data import minari_io
-from velap.data.frames import (
-    Extras,
-    FrameStore,
-    content_hash,
-    load_positions,
-    load_store,
-    make_store,
-    stack_indices,
-    write_dataset,
-)
+from velap.data.frames import FrameStore, content_hash, stack_indices
+from velap.data.loading import load_store
+from velap.data.minari_io import load_positions
+from velap.data.writing import Extras, write_dataset
 from velap.errors import DatasetError, StorageError
 
 ACTIONS = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -55,7 +49,9 @@ def a_store(dataset_id: str = "velap/Toy-v0", seed: int = 0) -> FrameStore:
     truncated[last - 1] = True
     rewards[last[1] - 1], terminated[last[1] - 1], truncated[last[1] - 1] = 1, True, False
     frames = rng.integers(0, 256, (rows, 64, 64, 3), dtype=np.uint8)
-    return make_store(frames, actions, rewards, terminated, truncated, np.array(LENGTHS), [-1, -1], [1, 1], dataset_id)
+    return FrameStore.from_arrays(frames=frames, actions=actions, rewards=rewards, terminated=terminated,
+    truncated=truncated,
+                                  episode_length=LENGTHS, action_low=[-1, -1], action_high=[1, 1], dataset_id=dataset_id)
 
 
 def stranger(observations, space: gym.Space = RGB, *, rewards=None, actions=None, terminations=None, truncations=None,
@@ -347,6 +343,16 @@ def test_two_reward_levels_are_binarised():
     assert store.rewards.tolist() == [0, 0, 0, 1, 0, 0, 0, 0, 0]
 
 
+@pytest.mark.parametrize(("values", "rule"), [((-1, -1, -1, 0), "reward>=0"), ((0.1, 0.1, 0.1, 1), "reward>=1"),
+                                              ((-1, -1, -1, -0.5), "reward>=-0.5")])
+def test_the_higher_of_two_rewards_is_success_whatever_its_sign(values: tuple[float, ...], rule: str):
+    dataset_id = stranger(two_episodes(), rewards=[np.array(values, float), np.full(3, values[0])])
+    with pytest.warns(UserWarning, match="is read as success"):
+        store = load_store(dataset_id)
+    assert store.rewards.tolist() == [0, 0, 0, 1, 0, 0, 0, 0, 0]
+    assert store.reading.success == rule
+
+
 def test_an_episode_ends_at_its_first_success():
     never = [np.zeros(4, bool), np.zeros(3, bool)]
     ends = [np.array([False, False, False, True]), np.array([False, False, True])]
@@ -398,13 +404,23 @@ def test_missing_dataset_and_bad_id():
     refused("velap/Toy", "a version at the end")
 
 
-def test_float_images_are_refused():
-    space = gym.spaces.Box(0.0, 1.0, (64, 64, 3), np.float32)
-    refused(stranger([frames / np.float32(255) for frames in two_episodes()], space), r"float32.*np.round\(255")
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 1.0), (0.0, 255.0)])
+def test_float_images_are_rounded_by_the_bounds_of_their_space(low: float, high: float):
+    observations = noise((64, 64, 3))
+    stored = [(low + frames / 255 * (high - low)).astype(np.float32) for frames in observations]
+    store = load_store(stranger(stored, gym.spaces.Box(low, high, (64, 64, 3), np.float32)))
+    np.testing.assert_array_equal(store.frames, np.concatenate(observations))
+
+
+@pytest.mark.parametrize("space", [gym.spaces.Box(-np.inf, np.inf, (64, 64, 3), np.float32),
+                                   gym.spaces.Box(0, 1023, (64, 64, 3), np.uint16)])
+def test_images_of_other_numbers_are_refused(space: gym.spaces.Box):
+    refused(stranger([frames.astype(space.dtype) for frames in two_episodes()], space), r"int16|inf.*np.round\(255")
 
 
 @pytest.mark.parametrize(("shape", "hint"), [((64, 64, 9), "stacks frames itself"), ((9, 64, 64), "stacks frames itself"),
-                                             ((64, 64, 4), "red, green and blue"), ((48, 64, 3), "square")])
+                                             ((4, 84, 84), "newest frame"), ((4, 64, 64, 3), "newest frame"),
+                                             ((64, 64, 4), "red, green and blue"), ((48, 64, 3), "--fit pad")])
 def test_wrong_image_shapes_are_refused(shape: tuple[int, ...], hint: str):
     observations = [np.zeros((count, *shape), np.uint8) for count in (5, 4)]
     refused(stranger(observations, gym.spaces.Box(0, 255, shape, np.uint8)), hint)
@@ -425,8 +441,8 @@ def test_actions_and_rewards_must_be_finite(bad: float):
 
 
 @pytest.mark.parametrize(("values", "match"), [
-    ((0, 0, 0, 0), "never positive"), ((-1, -1, -1, 0), "never positive"), ((1, 1, 1, 1), "every reward"),
-    ((0, 0.5, 0.7, 1), r"float\(reward >= 1\)"),
+    ((0, 0, 0, 0), r"is 0.*--success labels:"), ((1, 1, 1, 1), "every reward.*is 1"),
+    ((0, 0.5, 0.7, 1), r"4 different rewards.*'reward>=1'"),
 ])
 def test_rewards_that_are_not_sparse(values: tuple[float, ...], match: str):
     other = np.full(3, values[0], float)

@@ -18,7 +18,9 @@ from studies import benchmarks, speed
 from studies.benchmarks import Measurement, in_turns, peak_memory, synthetic_store
 from studies.speed import BENCHMARKS, Benchmark, run_benchmarks
 from velap.config import Config, override
-from velap.data.frames import content_hash, load_store, write_dataset
+from velap.data.frames import content_hash
+from velap.data.loading import load_store
+from velap.data.writing import write_dataset
 from velap.envs.gl import BACKENDS
 from velap.errors import CheckpointError, ConfigError
 from velap.methods.mppi import MPPIConfig

@@ -78,7 +78,7 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         command: kept in the checkpoint as its origin.
         on_progress: called after every logged step.
     """
-    from velap.data.frames import load_store
+    from velap.data.loading import load_store
     from velap.methods.base import get_method
     from velap.methods.learning import check_trainable, train_head
     from velap.training.loop import MODEL

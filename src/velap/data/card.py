@@ -63,9 +63,8 @@ def dataset_card(store: FrameStore, task: Task | None = None, positions: np.ndar
         f"# Dataset {store.dataset_id}", "",
         f"- episodes: {store.n_episodes:,} of {store.episode_length.min()} to {store.episode_length.max()} transitions "
         f"(mean {store.episode_length.mean():.1f})",
-        f"- transitions: {transitions:,}; frames: {len(store.frames):,} of {store.frames.shape[1]}×{store.frames.shape[2]} "
-        "px, "
-        f"{store.frames.nbytes / 1e6:,.0f} MB in memory",
+        f"- transitions: {transitions:,}; frames: {len(store.frames):,} of "
+        f"{store.frames.shape[1]}×{store.frames.shape[2]} px, {store.frames.nbytes / 1e6:,.0f} MB in memory",
         f"- successful transitions: {successes} ({share:.2f} %){paper}",
         f"- episodes ended by success: {successes}, by failure: {failures}, cut off: {int(store.truncated.sum())}",
         f"- actions: {store.actions.shape[1]} entries, from {_numbers(actions.min(axis=0))} to "

@@ -22,8 +22,9 @@ from gymnasium.envs.registration import EnvSpec
 from velap.data import card as cards
 from velap.data import minari_io
 from velap.data.behaviours import mixture, reset_options
-from velap.data.frames import Extras, FrameStore, make_store, write_dataset
+from velap.data.frames import FrameStore, Reading
 from velap.data.worker import Job, Progress, Shard, describe, test_starts, workers
+from velap.data.writing import Extras, write_dataset
 from velap.errors import StorageError
 from velap.storage import replace_file
 from velap.tasks import Task, get_task
@@ -100,8 +101,10 @@ def _assemble(directory: Path, shards: list[Shard], description: dict[str, Any],
                 part.append(file[key])
     arrays = {key: np.concatenate(part) for key, part in parts.items()}
     low, high = np.asarray(description["action_low"]), np.asarray(description["action_high"])
-    store = make_store(frames, arrays["actions"], arrays["rewards"], arrays["terminated"], arrays["truncated"],
-                       arrays["length"], low, high, dataset_id)
+    store = FrameStore.from_arrays(frames=frames, actions=arrays["actions"], rewards=arrays["rewards"],
+                                   terminated=arrays["terminated"], truncated=arrays["truncated"],
+                                   episode_length=arrays["length"], action_low=low, action_high=high, dataset_id=dataset_id,
+                                   reading=Reading(success="reward>=1"))
     return store, arrays
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,12 @@ IMAGE_SIZE = 64
 """Side of the images that the networks read [px], Table 2."""
 MIN_SIDE = 8
 """Boxes with a shorter side are vectors or small matrices, not images [px]. ours."""
+FLOAT_RANGES = ((0.0, 1.0), (-1.0, 1.0), (0.0, 255.0))
+"""Bounds that float images may have."""
+
+Fit = Literal["crop", "pad", "squash"]
+"""How an oblong image becomes a square one: cut to its middle, padded with black on both sides, or squashed."""
+FITS: tuple[Fit, ...] = ("crop", "pad", "squash")
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,15 @@ class ImageLayout:
     shape: tuple[int, ...]
     """Shape of one image as stored."""
     channel_first: bool
+    dtype: str = "uint8"
+    """Number type as stored."""
+    bounds: tuple[float, float] = (0.0, 255.0)
+    """Values of black and white."""
+
+    @property
+    def name(self) -> str:
+        """The key as the user writes it, `a/b`; empty for a plain Box."""
+        return "/".join(self.key)
 
     @property
     def sides(self) -> tuple[int, ...]:
@@ -39,6 +55,12 @@ class ImageLayout:
             return 1
         return self.shape[0] if self.channel_first else self.shape[2]
 
+    def of(self, observation: Any) -> np.ndarray:
+        """The image [..., *shape] of one observation, or of the observations of an episode."""
+        for key in self.key:
+            observation = observation[key]
+        return np.asarray(observation)
+
 
 def _leaves(space: gym.Space, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], gym.Space]]:
     if isinstance(space, gym.spaces.Dict):
@@ -51,11 +73,12 @@ def _leaves(space: gym.Space, path: tuple[str, ...] = ()) -> Iterator[tuple[tupl
 def _layout(path: tuple[str, ...], space: gym.Space) -> ImageLayout | None:
     """The layout of an image-like Box of any number type, None for everything else."""
     shape = space.shape if isinstance(space, gym.spaces.Box) else None
-    if shape is None or len(shape) not in (2, 3):
+    if shape is None or len(shape) not in (2, 3, 4):
         return None
-    channel_first = len(shape) == 3 and shape[0] < shape[2]
-    layout = ImageLayout(path, shape, channel_first)
-    return layout if min(layout.sides) >= MIN_SIDE else None
+    image = shape[-3:]
+    channel_first = len(image) == 3 and image[0] < image[2]
+    layout = ImageLayout(path, shape, channel_first, str(space.dtype))
+    return layout if min(ImageLayout(path, image, channel_first).sides) >= MIN_SIDE else None
 
 
 def _listing(leaves: dict[tuple[str, ...], gym.Space]) -> str:
@@ -65,57 +88,95 @@ def _listing(leaves: dict[tuple[str, ...], gym.Space]) -> str:
     return ", ".join(f"{'/'.join(path) or 'observation'}: {brief(space)}" for path, space in leaves.items())
 
 
-def find_image(space: gym.Space, image_key: str | None, dataset_id: str,
-               advice: str = "render the frames into the dataset first") -> ImageLayout:
+def find_image(space: gym.Space, image_key: str | None, where: str,
+               advice: str = "render the frames into the dataset first", fit: Fit | None = None) -> ImageLayout:
     """The image of an observation space: the one named (`a/b` for nested Dicts), or the only one there is.
 
-    `advice` says what to do where there is none.
+    Args:
+        space: of one observation.
+        image_key: key of the image; needed only where there are several.
+        where: name of the dataset or environment, for messages.
+        advice: what to do where there is no image.
+        fit: how an oblong image becomes square; without it such an image is refused.
     """
     leaves = dict(_leaves(space))
-    if image_key is not None and () not in leaves:
-        path = tuple(image_key.split("/"))
-        if path not in leaves:
-            raise DatasetError(f"{dataset_id} has no observation key {image_key!r}; expected one of {_listing(leaves)}. "
+    if image_key and () not in leaves:
+        path = next((path for path in leaves if "/".join(path) == image_key), None)
+        if path is None:
+            raise DatasetError(f"{where} has no observation key {image_key!r}; expected one of {_listing(leaves)}. "
                                "Name the image with --image-key.")
         leaves = {path: leaves[path]}
     found = [layout for path, leaf in leaves.items() if (layout := _layout(path, leaf)) is not None]
     if len(found) > 1:
-        found = [layout for layout in found if leaves[layout.key].dtype == np.uint8] or found
+        found = [layout for layout in found if layout.dtype == "uint8"] or found
     if not found:
-        raise DatasetError(f"{dataset_id} has no image among its observations ({_listing(leaves)}); expected uint8 images "
+        raise DatasetError(f"{where} has no image among its observations ({_listing(leaves)}); expected images "
                            f"[H, W, 3]. velap learns from pixels: {advice}.")
     if len(found) > 1:
-        raise DatasetError(f"{dataset_id} has several images among its observations ({_listing(leaves)}); expected one. "
-                           "Name the one to use with --image-key.")
-    _check(found[0], leaves[found[0].key], dataset_id)
-    return found[0]
+        cameras = ", ".join(layout.name for layout in found)
+        raise DatasetError(f"{where} has several images among its observations: {cameras}; expected one. "
+                           f"Name the one to use with --image-key, for example --image-key {found[0].name}.")
+    box = leaves[found[0].key]
+    assert isinstance(box, gym.spaces.Box)
+    return _checked(found[0], box, where, fit)
 
 
-def _check(layout: ImageLayout, box: gym.Space, dataset_id: str) -> None:
-    what = f"{dataset_id}: {'/'.join(layout.key) or 'the observation'} is {box.dtype} of shape {layout.shape}"
-    if box.dtype != np.uint8:
-        raise DatasetError(f"{what}; expected uint8 in 0 to 255. Convert it and write the dataset again, for floats in 0 "
-                           "to 1: "
-                           "np.round(255 * frame).astype(np.uint8).")
+def _checked(layout: ImageLayout, box: gym.spaces.Box, where: str, fit: Fit | None) -> ImageLayout:
+    """The layout with its bounds; raises DatasetError where it cannot become an RGB square."""
+    what = f"{where}: {layout.name or 'the observation'} is {box.dtype} of shape {layout.shape}"
+    if len(layout.shape) == 4:
+        raise DatasetError(f"{what}, several frames; expected one. Store the newest frame alone, velap stacks frames "
+                           "itself.")
     if layout.channels not in (1, 3):
-        hint = ("store the newest frame alone, velap stacks frames itself" if layout.channels % 3 == 0
+        stacked = layout.channels % 3 == 0 or layout.channel_first
+        hint = ("store the newest frame alone, velap stacks frames itself" if stacked
                 else "keep red, green and blue only")
         raise DatasetError(f"{what}, {layout.channels} channels; expected 3 or 1. Write the dataset again: {hint}.")
-    if layout.sides[0] != layout.sides[1]:
-        raise DatasetError(f"{what}; expected square images. Crop or pad them to a square and write the dataset again; "
-                           "squares "
-                           f"of any size are resized to {IMAGE_SIZE}×{IMAGE_SIZE} when read.")
+    if layout.sides[0] != layout.sides[1] and fit is None:
+        raise DatasetError(f"{what}; expected square images. Say how they become square: --fit crop (their middle), "
+                           "--fit pad (black beside them) or --fit squash.")
+    if box.dtype == np.uint8:
+        return layout
+    bounds = (float(box.low.min()), float(box.high.max()))
+    if not np.issubdtype(box.dtype, np.floating) or bounds not in FLOAT_RANGES:
+        raise DatasetError(f"{what} from {bounds[0]:g} to {bounds[1]:g}; expected uint8, or floats with the bounds 0 and 1, "
+                           "-1 and 1, or 0 and 255. Convert it, for values in 0 to 1: np.round(255 * "
+                           "frame).astype(np.uint8).")
+    return ImageLayout(layout.key, layout.shape, layout.channel_first, layout.dtype, bounds)
 
 
-def to_rgb(raw: np.ndarray, layout: ImageLayout, size: int | None) -> np.ndarray:
-    """uint8 [T+1, *layout.shape] as stored → uint8 [T+1, size, size, 3]: grey repeated, channels last, resized."""
+def to_rgb(raw: np.ndarray, layout: ImageLayout, size: int | None, fit: Fit | None = None) -> np.ndarray:
+    """[T+1, *layout.shape] as stored → uint8 [T+1, size, size, 3]: grey repeated, channels last, square, resized.
+
+    With `size` None squares keep their side.
+    """
     if layout.channel_first:
         raw = np.moveaxis(raw, 1, -1)
     elif raw.ndim == 3:
         raw = raw[..., None]
+    if raw.dtype != np.uint8:
+        low, high = layout.bounds
+        raw = np.round((raw.astype(np.float32) - low) * (255 / (high - low))).clip(0, 255).astype(np.uint8)
     if raw.shape[-1] == 1:
         raw = np.broadcast_to(raw, (*raw.shape[:3], 3))
-    if size is None or raw.shape[1] == size:
+    if fit is not None:
+        raw = _square(raw, fit)
+    side = size or min(raw.shape[1:3])
+    if raw.shape[1:3] == (side, side):
         return raw
-    return np.stack([np.asarray(Image.fromarray(np.ascontiguousarray(frame)).resize((size, size), Image.Resampling.BOX))
+    return np.stack([np.asarray(Image.fromarray(np.ascontiguousarray(frame)).resize((side, side), Image.Resampling.BOX))
                      for frame in raw])
+
+
+def _square(frames: np.ndarray, fit: Fit) -> np.ndarray:
+    """uint8 [T+1, H, W, 3] with both sides equal, but for `squash`, which leaves that to the resizing."""
+    height, width = frames.shape[1:3]
+    if height == width or fit == "squash":
+        return frames
+    short, beside = min(height, width), abs(height - width) // 2
+    if fit == "crop":
+        middle = slice(beside, beside + short)
+        return frames[:, middle] if height > width else frames[:, :, middle]
+    after = abs(height - width) - beside
+    sides = ((beside, after), (0, 0)) if height < width else ((0, 0), (beside, after))
+    return np.pad(frames, ((0, 0), *sides, (0, 0)))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 import errno
-import hashlib
 import json
 import shutil
 import struct
@@ -18,12 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from filelock import FileLock, Timeout
 from minari.dataset.minari_dataset import DATASET_ID_RE, MinariDataset
 from minari.namespace import create_namespace, list_local_namespaces
 from minari.storage.datasets_root_dir import get_dataset_path
 from minari.storage.local import list_local_datasets
 
+from velap.data.mapped import file_sha256
 from velap.errors import DatasetError, StorageError
 from velap.storage import sync
 
@@ -35,17 +36,23 @@ UNREADABLE = (
 
 DATA_FILE = "main_data.hdf5"
 METADATA_FILE = "metadata.json"
+POSITION_KEY = "agent_position"
+"""Key of the Minari `infos` that holds the agent's position at each frame, where the task knows it [m]."""
 VELAP_KEY = "velap"
 """Key of `metadata.json` under which velap keeps checksums and provenance."""
 
 
+def is_id(text: str) -> bool:
+    """Does Minari take that as `(namespace/)name-v0`?"""
+    match = DATASET_ID_RE.fullmatch(text)
+    return match is not None and match.group("version") is not None
+
+
 def check_dataset_id(dataset_id: str) -> None:
     """Raise DatasetError unless Minari takes `dataset_id` as `(namespace/)name-v0`."""
-    match = DATASET_ID_RE.fullmatch(dataset_id)
-    if match is None or match.group("version") is None:
-        raise DatasetError(f"{dataset_id!r} is not a Minari dataset id; expected (namespace/)name-v0: letters, digits, - "
-                           "and _, "
-                           "and a version at the end, for example velap/SpiralMaze-v0.")
+    if not is_id(dataset_id):
+        raise DatasetError(f"{dataset_id!r} is not a Minari dataset id; expected (namespace/)name-v0: letters, digits, "
+                           "- and _, and a version at the end, for example velap/SpiralMaze-v0.")
 
 
 def dataset_path(dataset_id: str) -> Path:
@@ -73,14 +80,7 @@ def storage_error(error: Exception, what: str) -> StorageError:
     else:
         way_out = "Make the place writable, or point MINARI_DATASETS_PATH to another one"
     return StorageError(f"could not write {what}: {reason}. Expected a disk with room that may be written to; nothing "
-                        "half-written "
-                        f"was put in place. {way_out}, and run the same command again.")
-
-
-def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+                        f"half-written was put in place. {way_out}, and run the same command again.")
 
 
 def make_namespace(dataset_id: str) -> None:
@@ -118,9 +118,8 @@ def exists(dataset_id: str) -> bool:
 def refuse_existing(dataset_id: str, overwrite: bool) -> None:
     """Raise DatasetError when the dataset is there and may not be replaced."""
     if exists(dataset_id) and not overwrite:
-        raise DatasetError(f"the dataset {dataset_id} exists already in {dataset_path(dataset_id)}; expected a free id. "
-                           "Give "
-                           "--overwrite to replace it, or another --dataset-id to keep both.")
+        raise DatasetError(f"the dataset {dataset_id} exists already in {dataset_path(dataset_id)}; expected a free "
+                           "id. Give --overwrite to replace it, or another --dataset-id to keep both.")
 
 
 @contextlib.contextmanager
@@ -171,6 +170,30 @@ def open_dataset(dataset_id: str) -> MinariDataset:
         raise damaged(dataset_id, f"Minari cannot open it ({type(error).__name__}: {error})") from error
 
 
+def raw_episodes(dataset: MinariDataset) -> Iterator[dict[str, Any]]:
+    """Episodes as Minari has them; whatever a damaged file makes its readers raise becomes a DatasetError."""
+    stored = iter(dataset.storage.get_episodes(dataset.episode_indices))
+    while True:
+        try:
+            episode = next(stored)
+        except StopIteration:
+            return
+        except UNREADABLE as error:
+            raise damaged(dataset.id, f"an episode cannot be read ({type(error).__name__}: {error})") from error
+        yield episode
+
+
+def load_positions(dataset_id: str) -> np.ndarray | None:
+    """float32 [F, P] positions of the agent [m], a row for each frame of the dataset; None where it has none."""
+    parts = []
+    for episode in raw_episodes(open_dataset(dataset_id)):
+        position = (episode["infos"] or {}).get(POSITION_KEY)
+        if position is None or np.ndim(position) != 2 or len(position) != len(episode["rewards"]) + 1:
+            return None
+        parts.append(np.asarray(position, np.float32))
+    return np.concatenate(parts) if parts else None
+
+
 def velap_metadata(metadata: dict[str, Any]) -> dict[str, Any]:
     """The part of `metadata.json` that velap wrote, empty for datasets of others."""
     entry = metadata.get(VELAP_KEY)
@@ -182,8 +205,7 @@ def damaged(dataset_id: str, detail: str) -> DatasetError:
     return DatasetError(f"the dataset {dataset_id} is damaged or was changed after it was written: "
                         f"{' '.join(detail.split())}. "
                         "Expected the files as they were written. Restore them from a copy, or write the dataset again "
-                        "(for a "
-                        "task of velap: velap collect TASK --overwrite).")
+                        "(for a task of velap: velap collect TASK --overwrite).")
 
 
 def _missing(dataset_id: str) -> str:
@@ -193,6 +215,5 @@ def _missing(dataset_id: str) -> str:
         known = []
     near = difflib.get_close_matches(dataset_id, known, n=3, cutoff=0.5) or known[:5]
     here = f"there are {', '.join(near)}" if near else "there is none yet"
-    return (f"no Minari dataset {dataset_id!r} under {get_dataset_path()}; expected a local dataset, {here}. Make it with "
-            "velap "
-            "collect TASK, fetch it with minari download, or set MINARI_DATASETS_PATH to where it lies.")
+    return (f"no Minari dataset {dataset_id!r} under {get_dataset_path()}; expected a local dataset, {here}. Make it "
+            "with velap collect TASK, fetch it with minari download, or set MINARI_DATASETS_PATH to where it lies.")

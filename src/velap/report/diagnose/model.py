@@ -16,7 +16,9 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from velap.config import Config
-from velap.data.frames import FrameStore, load_positions, load_store
+from velap.data.frames import FrameStore
+from velap.data.loading import load_store
+from velap.data.minari_io import load_positions
 from velap.data.sampling import WindowSampler
 from velap.errors import ConfigError
 from velap.models.horizon import q_from_steps, steps_from_q
