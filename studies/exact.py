@@ -23,9 +23,10 @@ from rich.console import Console
 from torch import Tensor
 
 from velap.config import Config, override
-from velap.data.behaviours import mixture, run_trajectory
+from velap.data.behaviours import run_trajectory
 from velap.data.frames import FrameStore
 from velap.data.sampling import WindowSampler
+from velap.envs.protocol import WithTrueState
 from velap.errors import ConfigError
 from velap.evaluation.console import View
 from velap.evaluation.evaluate import make_env, reset_options
@@ -79,14 +80,14 @@ class States:
 def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: View | None = None) -> States:
     """The trajectories that `velap collect` records, step for step, without drawing; `contexts` of them all where given."""
     env: Any = make_env(task.env_id).unwrapped
-    if not hasattr(env, "true_state"):
+    if not isinstance(env.unwrapped, WithTrueState):
         raise ConfigError(f"{task.name} tells no true state; expected one of the manipulation tasks.")
     env.render = env.true_state  # what the data hold in place of frames
     runs = []
     count = contexts or task.recipe.contexts
     for context in range(count):
         for trajectory in range(task.recipe.trajectories):
-            runs.append(run_trajectory(env, task.recipe, mixture(task.name), seed, context, trajectory))
+            runs.append(run_trajectory(env, task.recipe, task.shares, seed, context, trajectory))
         if view is not None:
             view.show(context + 1)
     rows = {name: np.concatenate([run[name] for run in runs])

@@ -16,7 +16,6 @@ from studies.matrix import Cell
 from studies.timings import Timings
 from velap.config import Config
 from velap.data import minari_io
-from velap.data.behaviours import mixture
 from velap.errors import ConfigError, RecordError
 from velap.evaluation.records import Record, read_records, record_path
 from velap.methods.base import get_method
@@ -83,7 +82,7 @@ class Inventory:
         if plan is None:
             foreign = minari_io.exists(get_task(task).dataset_id)
             return Finding(0, total, "trajectories", False, "velap did not collect the dataset there" if foreign else "")
-        wanted = {"task": task, "seed": DATASET_SEED, "recipe": dataclasses.asdict(recipe), "shares": mixture(task)}
+        wanted = {"task": task, "seed": DATASET_SEED, "recipe": dataclasses.asdict(recipe), "shares": get_task(task).shares}
         found = {**plan, "recipe": {**_recipe_defaults(), **plan.get("recipe", {})}}
         wrong = [name for name, value in wanted.items() if found.get(name) != json.loads(json.dumps(value))]
         problem = f"the dataset was collected with another {wrong[0]}" if wrong else ""

@@ -72,12 +72,12 @@ class Line(gym.Env):
 
 gym.register("velap_test/Line-v0", entry_point="velap_line_env:Line", max_episode_steps=50)
 '''
-TASK = Task("Line", "velap_line_env:velap_test/Line-v0", "velap_line_env:Line", 50, Recipe(1, 24, 6, 1.0))
+TASK = Task("Line", "velap_line_env:velap_test/Line-v0", 50, Recipe(1, 24, 6, 1.0))
 SCRIPT = """
 from velap.data import collection as collect
 from velap.tasks import Recipe, Task
 collect.SHARD_TRAJECTORIES = 4
-task = Task("Line", "velap_line_env:velap_test/Line-v0", "velap_line_env:Line", 50, Recipe(1, 24, 6, 1.0))
+task = Task("Line", "velap_line_env:velap_test/Line-v0", 50, Recipe(1, 24, 6, 1.0))
 collect.collect(task, seed=3, workers=2)
 """
 
@@ -157,12 +157,11 @@ def test_random_walk_is_the_papers():
 
 
 def test_behaviours_are_mixed_in_their_shares(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(behaviours.MIXTURES, "Line", {"random-walk": 3.0, "still": 1.0})
     monkeypatch.setitem(behaviours.BEHAVIOURS, "still", lambda env, recipe, rng: lambda frame: np.zeros(2, np.float32))
     import velap_line_env
 
     env = velap_line_env.Line()
-    shares = behaviours.mixture("Line")
+    shares = dataclasses.replace(TASK, behaviours={"random-walk": 3.0, "still": 1.0}).shares
     assert shares == {"random-walk": 0.75, "still": 0.25}
     runs = [behaviours.run_trajectory(env, TASK.recipe, shares, 0, 0, number) for number in range(400)]
     still = np.array([run["behaviour"][0] == 1 for run in runs])

@@ -145,9 +145,9 @@ def test_a_stored_trajectory_replays_to_the_same_states_and_pixels(task, tmp_pat
     monkeypatch.setattr(worker, "ProcessPoolExecutor", InThisProcess)
     monkeypatch.setattr(worker, "TEST_STARTS", 2)
     monkeypatch.setitem(behaviours.BEHAVIOURS, "noisy-expert", noisy_expert)
-    monkeypatch.setitem(behaviours.MIXTURES, task, {"noisy-expert": 1.0})
     recipe = Recipe(contexts=1, trajectories=1, max_steps=TASKS[task].max_steps, success_percent=1.0)
-    collect.collect(dataclasses.replace(TASKS[task], recipe=recipe), seed=4, dataset_id="velap/Replay-v0")
+    alone = dataclasses.replace(TASKS[task], recipe=recipe, behaviours={"noisy-expert": 1.0})
+    collect.collect(alone, seed=4, dataset_id="velap/Replay-v0")
     store, positions = load_store("velap/Replay-v0"), load_positions("velap/Replay-v0")
     kept = list(open_dataset("velap/Replay-v0").storage.get_episode_metadata([0]))
     assert store.rewards.sum() > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from metaworld.envs import SawyerFaucetCloseEnvV3, SawyerWindowCloseEnvV3
 
-from velap.data.behaviours import mixture, run_trajectory
+from velap.data.behaviours import run_trajectory
 from velap.envs.sawyer import tasks as sawyer_tasks
 from velap.envs.sawyer.physics import ACTION_SCALE
 from velap.tasks import TASKS, make_config
@@ -192,7 +192,7 @@ def test_data_of_the_drawer_hold_one_subtask_each():
 
 @pytest.mark.parametrize("name", SAWYER)
 def test_the_mixture_succeeds_as_often_as_table_10_says_and_never_from_a_test_start(name):
-    recipe, shares = TASKS[name].recipe, mixture(name)
+    recipe, shares = TASKS[name].recipe, TASKS[name].shares
     env, steps, successes = make(name), 0, dict.fromkeys(shares, 0)
     env.render = lambda size=64: np.zeros((1, 1, 3), np.uint8)
     for context in range(0, recipe.contexts, 20):

@@ -10,7 +10,7 @@ from rich.console import Console
 
 import velap.envs  # noqa: F401 - registers the tasks
 from studies.exact import ExactEncoder, collect_states, pack, study_exact_latents, unpack
-from velap.data.behaviours import mixture, position_of, run_trajectory
+from velap.data.behaviours import position_of, run_trajectory
 from velap.data.frames import stack_indices
 from velap.errors import ConfigError
 from velap.tasks import get_task
@@ -27,7 +27,7 @@ def test_states_are_those_of_the_recorded_trajectories(name):
     task = get_task(name)
     data = collect_states(task, contexts=1)
     env = gym.make(task.env_id).unwrapped
-    recorded = run_trajectory(env, task.recipe, mixture(name), 0, 0, 1)
+    recorded = run_trajectory(env, task.recipe, task.shares, 0, 0, 1)
     start, length = data.store.episode_start[1], data.store.episode_length[1]
     rows = slice(start, start + length + 1)
     assert np.array_equal(recorded["actions"], data.store.actions[rows]), "drawing must not change what happens"

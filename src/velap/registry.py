@@ -18,7 +18,7 @@ itself.
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
@@ -29,7 +29,7 @@ T = TypeVar("T")
 Entry = TypeVar("Entry")
 
 
-class Registry(Mapping[str, T], Generic[T]):
+class Registry(MutableMapping[str, T], Generic[T]):
     """Entries of one kind by name: in their order where one module of the package has them all, else in the alphabet's."""
 
     def __init__(self, kind: str, home: str) -> None:
@@ -60,6 +60,20 @@ class Registry(Mapping[str, T], Generic[T]):
             raise ConfigError(f"two {self.kind}s are called {name!r}: {self._entries[name]!r} and {entry!r}; expected one. "
                               "Give one of them another name.")
         self._entries[name] = entry
+
+    def __setitem__(self, name: str, entry: T) -> None:
+        """Put an entry in the place of another one."""
+        self._entries[name] = entry
+
+    def __delitem__(self, name: str) -> None:
+        """Forget an entry."""
+        del self._entries[name]
+
+    @property
+    def imported(self) -> Mapping[str, T]:
+        """The package's own entries, and those of other packages that have been asked for."""
+        self._import_home()
+        return dict(self._entries)
 
     def __getitem__(self, name: str) -> T:
         """The entry of that name; raises UnknownTaskError with the names that exist."""

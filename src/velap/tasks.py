@@ -1,10 +1,16 @@
-"""The only registry: task → environment, dataset recipe (Table 10), per-task overrides (Tables 7-9), horizon limits."""
+"""Tasks: environment, dataset recipe (Table 10), time limit and config of each (Tables 7-9).
+
+The six of the paper are here. Add your own by `velap.register_task("Mine")(Task(...))`, or by an entry point of the group
+`velap.tasks`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from velap import registry
 from velap.config import Config, override
 from velap.config.presets import (
     DEFAULT_CONTROLLER,
@@ -16,6 +22,7 @@ from velap.config.presets import (
     PAPER_TRAIN,
 )
 from velap.errors import UnknownTaskError
+from velap.registry import Registry
 
 PRESETS = ("default", "paper")
 
@@ -51,12 +58,14 @@ class Task:
 
     name: str
     env_id: str
-    """Gymnasium id."""
-    entry_point: str
-    """`module:Class`, imported only when the environment is made."""
+    """Gymnasium id; `module:Env-v0` imports a module that registers it."""
     max_steps: int
     """Time limit of an episode [steps], App. C."""
     recipe: Recipe
+    behaviours: Mapping[str, float] = field(default_factory=lambda: {"random-walk": 1.0})
+    """Share of the dataset's trajectories by each behaviour of `velap.data.behaviours`."""
+    entry_point: str | None = None
+    """`module:Class`, imported only when the environment is made. None: whoever registers the id, `module:Env-v0`, does."""
     overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Tables 7-9: fields that differ on this task, in both presets."""
     default_overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -65,7 +74,17 @@ class Task:
     @property
     def dataset_id(self) -> str:
         """Minari id of the dataset that `velap collect` writes with seed 0."""
-        return f"velap/{self.name}-v0"
+        return _dataset_id(self.name)
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """`behaviours` with shares that add up to 1."""
+        total = sum(self.behaviours.values())
+        return {name: share / total for name, share in self.behaviours.items()}
+
+
+def _dataset_id(name: str) -> str:
+    return f"velap/{name}-v0"
 
 
 _SAWYER_DEFAULTS: dict[str, dict[str, Any]] = {
@@ -173,144 +192,146 @@ _ALL_MOMENTS_DEFAULTS: dict[str, dict[str, Any]] = {
 """ours: the latent keeps all moments, values far from the goal count as much as near ones, and noise on the latents keeps
 π^g from learning single ones. The tree is the last resort: h errs by most of a step in latents with the moments' noise."""
 
-TASKS: dict[str, Task] = {
-    task.name: task
-    for task in (
-        Task(
-            name="SpiralMaze",
-            env_id="velap/SpiralMaze-v0",
-            entry_point="velap.envs.mazes.env:SpiralMaze",
-            max_steps=300,
-            recipe=Recipe(contexts=1, trajectories=1000, max_steps=20, success_percent=0.12),
-            overrides={
-                "model": {"frame_stack": 1},
-                "train": {"c1": 0.001},
-                "planner": {"n_sim": 10},
-                "controller": {"n_replan": 25},
+PAPER_TASKS = (
+    Task(
+        name="SpiralMaze",
+        env_id="velap/SpiralMaze-v0",
+        entry_point="velap.envs.mazes.env:SpiralMaze",
+        max_steps=300,
+        recipe=Recipe(contexts=1, trajectories=1000, max_steps=20, success_percent=0.12),
+        overrides={
+            "model": {"frame_stack": 1},
+            "train": {"c1": 0.001},
+            "planner": {"n_sim": 10},
+            "controller": {"n_replan": 25},
+        },
+        default_overrides={
+            "train": {**ONE_SCENE["train"], "c1": 0.02},
+            "planner": {
+                "n_iter": 1000,
+                "discard_low_exponent": 20.0,
+                "p_sparse": 0.9,
+                "p_value": 0.1,
+                "p_policy": 0.1,
+                "expansion_weight": 1.0,
+                "anchor": "snap",
             },
-            default_overrides={
-                "train": {**ONE_SCENE["train"], "c1": 0.02},
-                "planner": {
-                    "n_iter": 1000,
-                    "discard_low_exponent": 20.0,
-                    "p_sparse": 0.9,
-                    "p_value": 0.1,
-                    "p_policy": 0.1,
-                    "expansion_weight": 1.0,
-                    "anchor": "snap",
-                },
-                "controller": ONE_SCENE["controller"],
+            "controller": ONE_SCENE["controller"],
+        },
+    ),
+    Task(
+        name="ObstacleMaze",
+        env_id="velap/ObstacleMaze-v0",
+        entry_point="velap.envs.mazes.obstacle:ObstacleMaze",
+        max_steps=100,
+        recipe=Recipe(contexts=250, trajectories=20, max_steps=20, success_percent=0.11),
+        # Tables 7-9 give it the values that most tasks have: c1 = 0.01, n_iter 250, n_sim 5, n_replan 15
+        overrides={"model": {"frame_stack": 1}},
+        default_overrides={
+            "train": {
+                "c1": 0.02,
+                "rewarded_share": 0.01,
+                "encoder_steps": 3_000,
+                "reconstruction_side": 32,
+                "critic_loss": "cross_entropy",
+                "policy_relative": True,
+                "latent_value_steps": 8_000,
             },
-        ),
-        Task(
-            name="ObstacleMaze",
-            env_id="velap/ObstacleMaze-v0",
-            entry_point="velap.envs.mazes.obstacle:ObstacleMaze",
-            max_steps=100,
-            recipe=Recipe(contexts=250, trajectories=20, max_steps=20, success_percent=0.11),
-            # Tables 7-9 give it the values that most tasks have: c1 = 0.01, n_iter 250, n_sim 5, n_replan 15
-            overrides={"model": {"frame_stack": 1}},
-            default_overrides={
-                "train": {
-                    "c1": 0.02,
-                    "rewarded_share": 0.01,
-                    "encoder_steps": 3_000,
-                    "reconstruction_side": 32,
-                    "critic_loss": "cross_entropy",
-                    "policy_relative": True,
-                    "latent_value_steps": 8_000,
-                },
-                "planner": {
-                    "n_iter": 500,
-                    "discard_low_exponent": 10.0,
-                    "p_sparse": 0.9,
-                    "p_value": 0.1,
-                    "p_policy": 0.1,
-                    "expansion_weight": 1.0,
-                    "anchor": "none",
-                },
-                "controller": {"n_replan": 2},
+            "planner": {
+                "n_iter": 500,
+                "discard_low_exponent": 10.0,
+                "p_sparse": 0.9,
+                "p_value": 0.1,
+                "p_policy": 0.1,
+                "expansion_weight": 1.0,
+                "anchor": "none",
             },
-        ),
-        Task(
-            name="WindowClose",
-            env_id="velap/WindowClose-v0",
-            entry_point="velap.envs.sawyer.tasks:WindowClose",
-            max_steps=150,
-            recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.48, expert_radius=0.2),
-            overrides={
-                "train": {"c3": 0.5},
+            "controller": {"n_replan": 2},
+        },
+    ),
+    Task(
+        name="WindowClose",
+        env_id="velap/WindowClose-v0",
+        entry_point="velap.envs.sawyer.tasks:WindowClose",
+        max_steps=150,
+        recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.48, expert_radius=0.2),
+        behaviours={"random-walk": 0.43, "noisy-expert": 0.57},
+        overrides={
+            "train": {"c3": 0.5},
+        },
+        default_overrides=_MEMBERS_DEFAULTS,
+    ),
+    Task(
+        name="FaucetClose",
+        env_id="velap/FaucetClose-v0",
+        entry_point="velap.envs.sawyer.tasks:FaucetClose",
+        max_steps=150,
+        recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.31, expert_radius=0.2),
+        behaviours={"random-walk": 0.41, "noisy-expert": 0.59},
+        overrides={
+            "train": {"c3": 0.5},
+        },
+        default_overrides={
+            **_SAWYER_DEFAULTS,
+            "train": {**_SAWYER_DEFAULTS["train"], "clone_candidates": 8},
+        },
+    ),
+    Task(
+        name="ButtonWall",
+        env_id="velap/ButtonWall-v0",
+        entry_point="velap.envs.sawyer.tasks:ButtonWall",
+        max_steps=250,
+        recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.16, expert_radius=0.2),
+        behaviours={"random-walk": 0.835, "noisy-expert": 0.165},
+        overrides={
+            "train": {"c3": 0.5},
+            "planner": {"n_iter": 500, "n_sim": 10},
+            "controller": {"n_replan": 25},
+        },
+        default_overrides=_ALL_MOMENTS_DEFAULTS,
+    ),
+    Task(
+        name="DrawerButton",
+        env_id="velap/DrawerButton-v0",
+        entry_point="velap.envs.sawyer.tasks:DrawerButton",
+        max_steps=150,
+        recipe=Recipe(contexts=150, trajectories=20, max_steps=50, success_percent=0.16, expert_radius=0.2),
+        behaviours={"random-walk": 0.7, "noisy-expert": 0.3},
+        overrides={
+            "train": {"c3": 0.5},
+            "planner": {"n_sim": 10},
+        },
+        # two subtasks: less imitation; far from the goal held actions and π^g in turns, near it what has worked
+        default_overrides={
+            **_ALL_MOMENTS_DEFAULTS,
+            "model": {**_ALL_MOMENTS_DEFAULTS["model"], "held_policy": True, "success_policy": True},
+            "train": {
+                **_ALL_MOMENTS_DEFAULTS["train"],
+                "c3": 0.1,
+                "held_steps": 8_000,
+                "clone_steps": 3_000,
+                "clone_candidates": 1,
+                "clone_reach": 25,
             },
-            default_overrides=_MEMBERS_DEFAULTS,
-        ),
-        Task(
-            name="FaucetClose",
-            env_id="velap/FaucetClose-v0",
-            entry_point="velap.envs.sawyer.tasks:FaucetClose",
-            max_steps=150,
-            recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.31, expert_radius=0.2),
-            overrides={
-                "train": {"c3": 0.5},
-            },
-            default_overrides={
-                **_SAWYER_DEFAULTS,
-                "train": {**_SAWYER_DEFAULTS["train"], "clone_candidates": 8},
-            },
-        ),
-        Task(
-            name="ButtonWall",
-            env_id="velap/ButtonWall-v0",
-            entry_point="velap.envs.sawyer.tasks:ButtonWall",
-            max_steps=250,
-            recipe=Recipe(contexts=200, trajectories=10, max_steps=50, success_percent=0.16, expert_radius=0.2),
-            overrides={
-                "train": {"c3": 0.5},
-                "planner": {"n_iter": 500, "n_sim": 10},
-                "controller": {"n_replan": 25},
-            },
-            default_overrides=_ALL_MOMENTS_DEFAULTS,
-        ),
-        Task(
-            name="DrawerButton",
-            env_id="velap/DrawerButton-v0",
-            entry_point="velap.envs.sawyer.tasks:DrawerButton",
-            max_steps=150,
-            recipe=Recipe(contexts=150, trajectories=20, max_steps=50, success_percent=0.16, expert_radius=0.2),
-            overrides={
-                "train": {"c3": 0.5},
-                "planner": {"n_sim": 10},
-            },
-            # two subtasks: less imitation; far from the goal held actions and π^g in turns, near it what has worked
-            default_overrides={
-                **_ALL_MOMENTS_DEFAULTS,
-                "model": {**_ALL_MOMENTS_DEFAULTS["model"], "held_policy": True, "success_policy": True},
-                "train": {
-                    **_ALL_MOMENTS_DEFAULTS["train"],
-                    "c3": 0.1,
-                    "held_steps": 8_000,
-                    "clone_steps": 3_000,
-                    "clone_candidates": 1,
-                    "clone_reach": 25,
-                },
-                "controller": {**_ALL_MOMENTS_DEFAULTS["controller"], "held_turn": 8, "success_exponent": 30.0},
-            },
-        ),
-    )
-}
+            "controller": {**_ALL_MOMENTS_DEFAULTS["controller"], "held_turn": 8, "success_exponent": 30.0},
+        },
+    ),
+)
+"""The six tasks of App. C."""
+TASKS: Registry[Task] = registry.TASKS
+for _task in PAPER_TASKS:
+    TASKS.add(_task.name, _task)
 
 
 def get_task(name: str) -> Task:
     """The task of that name; raises UnknownTaskError with the names that exist."""
-    if name not in TASKS:
-        raise UnknownTaskError(f"unknown task {name!r}; expected one of {', '.join(TASKS)}. Names are case-sensitive.")
     return TASKS[name]
 
 
 def task_of(task_or_dataset: str) -> str:
     """The task that a dataset id belongs to; the id itself where it is a stranger's."""
-    if task_or_dataset in TASKS:
-        return task_or_dataset
-    return next((task.name for task in TASKS.values() if task.dataset_id == task_or_dataset), task_or_dataset)
+    name = task_or_dataset.removeprefix("velap/").removesuffix("-v0")
+    return name if name in TASKS and task_or_dataset in (name, _dataset_id(name)) else task_or_dataset
 
 
 def make_config(task: str, preset: str = "default") -> Config:

@@ -6,11 +6,12 @@ Letters: T transitions of one trajectory (it has T + 1 frames), A action entries
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from velap.envs.protocol import HasTestRegion, Positioned, ScriptedTask
 from velap.tasks import Recipe
 
 Policy = Callable[[np.ndarray], np.ndarray]
@@ -37,20 +38,6 @@ def random_walk(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Polic
     return act
 
 
-@runtime_checkable
-class ScriptedTask(Protocol):
-    """What `noisy_expert` asks of an environment."""
-
-    def in_test_region(self) -> bool:
-        """Is the agent where test episodes start?"""
-
-    def expert_distance(self) -> float:
-        """Distance to what the expert acts on in the data [m]; infinite where it stays silent."""
-
-    def expert_action(self) -> np.ndarray:
-        """The expert's action [A]."""
-
-
 def noisy_expert(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Policy:
     """The random walk; within `recipe.expert_radius` of the goal the expert, with Gaussian noise of `recipe.expert_noise`.
 
@@ -74,20 +61,6 @@ def noisy_expert(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Poli
 
 BEHAVIOURS: dict[str, Behaviour] = {"random-walk": random_walk, "noisy-expert": noisy_expert}
 """Behaviours by name."""
-MIXTURES: dict[str, Mapping[str, float]] = {
-    "WindowClose": {"random-walk": 0.43, "noisy-expert": 0.57},
-    "FaucetClose": {"random-walk": 0.41, "noisy-expert": 0.59},
-    "ButtonWall": {"random-walk": 0.835, "noisy-expert": 0.165},
-    "DrawerButton": {"random-walk": 0.7, "noisy-expert": 0.3},
-}
-"""Share of trajectories of each behaviour, by task; tasks that are not named use the random walk alone."""
-
-
-def mixture(task: str) -> dict[str, float]:
-    """Behaviour names and their shares, which add up to 1."""
-    shares = dict(MIXTURES.get(task, {"random-walk": 1.0}))
-    total = sum(shares.values())
-    return {name: share / total for name, share in shares.items()}
 
 
 def reset_options(context: int) -> dict[str, Any]:
@@ -97,8 +70,8 @@ def reset_options(context: int) -> dict[str, Any]:
 
 def position_of(env: gym.Env) -> np.ndarray:
     """float32 [P] position of the agent [m], P = 0 where the environment does not tell."""
-    ask = getattr(env.unwrapped, "agent_position", None)
-    return np.zeros(0, np.float32) if ask is None else np.asarray(ask(), np.float32)
+    task = env.unwrapped
+    return np.asarray(task.agent_position(), np.float32) if isinstance(task, Positioned) else np.zeros(0, np.float32)
 
 
 def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], seed: int, context: int,
@@ -120,8 +93,9 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
     chosen = int(rng.choice(len(names), p=[shares[name] for name in names]))
     frame, _ = env.reset(seed=reset_seed, options=reset_options(context))
     policy = BEHAVIOURS[names[chosen]](env, recipe, rng)
-    in_test_region = getattr(env.unwrapped, "in_test_region", lambda: False)
-    visited = in_test_region()
+    task = env.unwrapped
+    tells = isinstance(task, HasTestRegion)
+    visited = tells and task.in_test_region()
     frames, positions = [np.array(frame)], [position_of(env)]
     steps: list[tuple[np.ndarray, float, bool, bool]] = []
     while len(steps) < recipe.max_steps:
@@ -133,7 +107,7 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
         steps.append((action, float(reward), bool(terminated), bool((truncated or full) and not terminated)))
         if terminated or truncated:
             break
-        visited = visited or in_test_region()
+        visited = visited or (tells and task.in_test_region())
     actions, rewards, ends, cuts = zip(*steps, strict=True)
     return {
         "frames": np.stack(frames),
@@ -146,5 +120,5 @@ def run_trajectory(env: gym.Env, recipe: Recipe, shares: Mapping[str, float], se
         "reset_seed": np.array([reset_seed]),
         "context": np.array([context]),
         "behaviour": np.array([chosen]),
-        "from_test": np.array([int(visited and rewards[-1] > 0) if hasattr(env.unwrapped, "in_test_region") else -1]),
+        "from_test": np.array([int(visited and rewards[-1] > 0) if tells else -1]),
     }

@@ -21,7 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from velap.data import card as cards
 from velap.data import minari_io
-from velap.data.behaviours import mixture, reset_options
+from velap.data.behaviours import reset_options
 from velap.data.frames import FrameStore, Reading
 from velap.data.worker import Job, Progress, Shard, describe, test_starts, workers
 from velap.data.writing import Extras, write_dataset
@@ -181,7 +181,7 @@ def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, 
 def _collect(task: Task, seed: int, count: int, dataset_id: str, resume: bool, progress: Progress,
              command: str) -> CollectResult:
     began, work, shards = time.monotonic(), minari_io.partial_path(dataset_id), _shards(task)
-    shares = mixture(task.name)
+    shares = task.shares
     job = Job(task.env_id, task.recipe, tuple(shares.items()), seed, work / "shards")
     try:
         with workers(count, job) as running:

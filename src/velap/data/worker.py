@@ -24,6 +24,7 @@ import numpy as np
 from loky import ProcessPoolExecutor
 
 from velap.data.behaviours import position_of, run_trajectory
+from velap.envs.protocol import Mapped
 from velap.errors import DatasetError, VelapError
 from velap.storage import replace_file
 from velap.tasks import Recipe
@@ -80,7 +81,7 @@ def describe(job: Job) -> dict[str, Any]:
         "action_low": space.low.tolist(),
         "action_high": space.high.tolist(),
         "env_spec": env.spec.to_json() if env.spec is not None else None,
-        "extent": list(getattr(env.unwrapped, "extent", ())),
+        "extent": list(env.unwrapped.extent) if isinstance(env.unwrapped, Mapped) else [],
     }
 
 

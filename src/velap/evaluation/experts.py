@@ -19,6 +19,7 @@ from rich.console import Console
 
 import velap.envs  # noqa: F401 - registers the tasks
 from velap.envs.mazes.geometry import Layout
+from velap.envs.protocol import Walled
 from velap.evaluation.console import View
 from velap.runs import write_atomic
 from velap.tasks import TASKS, Task, get_task
@@ -108,7 +109,7 @@ def try_task(task: Task, seeds: Sequence[int], on_episode: Callable[[int], objec
     """Expert, uniform actions and straight lines from the test starts of those seeds."""
     world: Any = gym.make(task.env_id).unwrapped
     lengths, lucky, held = [], 0, 0
-    maze = hasattr(world, "layout")
+    maze = isinstance(world, Walled)
     for seed in seeds:
         length = episode(world, world.expert_action, seed, task.max_steps)
         lengths += [] if length is None else [length]

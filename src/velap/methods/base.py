@@ -163,8 +163,8 @@ def get_method(name: str) -> Method:
 
 
 def learning_methods() -> list[str]:
-    """Names of the methods that learn something beside the joint checkpoint."""
-    return [name for name in METHODS if get_method(name).learns]
+    """Names of the methods that learn something beside the joint checkpoint, as far as they are imported."""
+    return sorted(name for name, method in METHODS.imported.items() if method.head is not None)
 
 
 def make_agent(method: str, model: LatentModel | None, config: Config, action_space: Box, head: Head | None = None,

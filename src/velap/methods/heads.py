@@ -20,6 +20,7 @@ from velap.errors import CheckpointError
 from velap.methods.base import get_method, learning_methods
 from velap.models.networks import Policy
 from velap.models.velap import WEIGHTS_SHA256, restore, shared_weights
+from velap.registry import METHODS
 from velap.runs import content_sha256, load_tensors, save_tensors
 
 
@@ -99,10 +100,10 @@ def load_head(path: Path | str, joint_metadata: Mapping[str, str], device: torch
                               "beside the joint checkpoint. Train it, or name another file.")
     tensors, metadata = load_tensors(path)
     method = metadata.get("method", "")
-    known, found = learning_methods(), metadata.get("format")
-    if found != HEAD_FORMAT or method not in known:
+    found = metadata.get("format")
+    if found != HEAD_FORMAT or method not in METHODS or not get_method(method).learns:
         raise CheckpointError(f"{path} has format {found!r} and method {method!r}; expected {HEAD_FORMAT!r} and one of "
-                              f"{', '.join(known)}. Give the file that `velap train --method` wrote.")
+                              f"{', '.join(learning_methods())}. Give the file that `velap train --method` wrote.")
     own, given = metadata.get("joint", "none"), shared_weights(joint_metadata)
     if own != given:
         raise CheckpointError(f"{path} is foreign to this joint checkpoint: it was learnt on the latents of weights "

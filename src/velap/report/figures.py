@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sklearn.manifold import Isomap
 
 from velap.data.frames import stack_indices
+from velap.envs.protocol import Mapped
 from velap.evaluation.rollout import FrameReader
 from velap.models.velap import LatentModel
 from velap.runs import write_atomic
@@ -53,7 +54,7 @@ class LatentMap:
 
 def can_probe(env: gym.Env[Any, Any]) -> bool:
     """Whether the environment can put its robot where it is told and says what its camera sees."""
-    return all(hasattr(env.unwrapped, name) for name in ("set_agent_position", "free_positions", "extent"))
+    return isinstance(env.unwrapped, Mapped)
 
 
 @torch.inference_mode()

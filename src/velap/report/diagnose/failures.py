@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from velap.envs.protocol import Measured, Positioned, WithObjects, WithSubtasks
 from velap.evaluation.evaluate import BATCH, Player
 from velap.evaluation.rollout import Episode
 from velap.methods.base import Agent
@@ -160,10 +161,13 @@ class Tracer:
     def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
         """One state of one episode."""
         trace, world = self.traces.setdefault(seed, Trace(seed)), env.unwrapped
-        for name, kept in (("agent_position", trace.positions), ("objects", trace.objects), ("subtasks", trace.subtasks)):
-            if hasattr(world, name):
-                kept.append(getattr(world, name)())
-        if hasattr(world, "geodesic_steps"):
+        if isinstance(world, Positioned):
+            trace.positions.append(world.agent_position())
+        if isinstance(world, WithObjects):
+            trace.objects.append(world.objects())
+        if isinstance(world, WithSubtasks):
+            trace.subtasks.append(world.subtasks())
+        if isinstance(world, Measured):
             trace.goal_steps.append(float(world.geodesic_steps(trace.positions[-1])))
         if outcome is not None:
             trace.success, trace.steps = outcome.success, outcome.steps

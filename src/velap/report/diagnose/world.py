@@ -18,13 +18,14 @@ from velap.data.commands import past_commands
 from velap.data.frames import stack_indices
 from velap.envs.mazes.env import STEP_LENGTH
 from velap.envs.mazes.geometry import Layout, Rect
+from velap.envs.protocol import Expert, Mapped, Walled
 from velap.evaluation.evaluate import Player, reset_options
 from velap.evaluation.experts import episode
 from velap.evaluation.rollout import FrameReader
 from velap.models.velap import LatentModel
 from velap.report.diagnose.model import Album, ValueCurve, local_steps, rank_correlation, value_curve
 from velap.report.diagnose.plans import Starts
-from velap.report.figures import can_probe, probe
+from velap.report.figures import probe
 
 PROBED = 400
 """States that a maze is judged by. ours."""
@@ -74,7 +75,7 @@ class Scene:
 
 def has_layout(env: gym.Env[Any, Any]) -> bool:
     """Whether true distances can be computed: a maze of ours."""
-    return can_probe(env) and isinstance(getattr(env.unwrapped, "layout", None), Layout)
+    return isinstance(env.unwrapped, Mapped) and isinstance(env.unwrapped, Walled)
 
 
 def distances_to(layout: Layout, points: NDArray[np.float64], goal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -129,7 +130,7 @@ def first_states(player: Player, env: gym.Env[Any, Any], seeds: Sequence[int]) -
 def expert_curves(model: LatentModel, env: gym.Env[Any, Any], frame_stack: int, seeds: Sequence[int]) -> list[ValueCurve]:
     """Q^g along the scripted expert's episodes that succeed; none where the environment has no expert."""
     world: Any = env.unwrapped
-    if not hasattr(world, "expert_action") or env.spec is None or env.spec.max_episode_steps is None:
+    if not isinstance(env.unwrapped, Expert) or env.spec is None or env.spec.max_episode_steps is None:
         return []
     device, curves, space = next(model.parameters()).device, [], world.action_space
     for seed in seeds:
