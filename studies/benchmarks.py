@@ -37,6 +37,7 @@ from velap.runs import make_generator
 from velap.search.est import plan
 from velap.search.types import SearchFns
 from velap.tasks import get_task, make_config
+from velap.threads import usable_cores
 from velap.training.loop import Trainer, keep_freed_memory, train
 
 TASK = "SpiralMaze"
@@ -330,7 +331,7 @@ def collect_frames_per_s(device: torch.device) -> Measurement:
     short = replace(task, recipe=replace(task.recipe, contexts=COLLECTED_CONTEXTS))
     with TemporaryDirectory() as folder, _datasets_in(folder):
         result = collect(short, dataset_id="bench/collected-v0")
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     return Measurement((result.transitions + result.episodes) / result.seconds, "frames/s",
                        f"the bound: 100,000 frames in 10 minutes; {COLLECTED_CONTEXTS} contexts of WindowClose, "
                        f"{cores} cores",

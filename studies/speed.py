@@ -6,7 +6,6 @@ A benchmark is a function of `studies.benchmarks` with a line in `BENCHMARKS`.
 from __future__ import annotations
 
 import json
-import os
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -21,6 +20,7 @@ from studies import benchmarks
 from studies.benchmarks import Measurement
 from velap.errors import ConfigError
 from velap.runs import write_atomic
+from velap.threads import usable_cores
 from velap.training.loop import pick_device
 
 
@@ -70,7 +70,7 @@ def hardware() -> str:
     if cpuinfo.exists():
         named = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         model = named[0].partition(":")[2].strip() if named else model
-    return f"{model}, {len(os.sched_getaffinity(0))} cores"
+    return f"{model}, {usable_cores()} cores"
 
 
 def run_benchmarks(console: Console, json_path: Path | None = None, device: str = "auto",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import os
 from pathlib import Path
 from typing import Annotated, Literal
@@ -31,6 +29,9 @@ def serve(checkpoint: Checkpoint, method: str = "velap", host: str = "127.0.0.1"
         image_key: Key of the camera's picture in observations, `a/b` when nested; the only picture unless said.
         head: What the method learnt; METHOD.safetensors beside the checkpoint unless said.
     """
+    import asyncio
+    import logging
+
     try:
         from velap.serve.server import Server
     except ImportError as error:

@@ -1,8 +1,7 @@
-"""Progress on a terminal, and as plain lines in a log file."""
+"""Progress: a bar on a terminal, plain lines in a log file."""
 
 from __future__ import annotations
 
-import os
 import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -10,13 +9,11 @@ from typing import TYPE_CHECKING, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from velap.config.training import TrainConfig
-
 if TYPE_CHECKING:
     from velap.evaluation.records import Record
     from velap.training.steps import Progress as TrainProgress
 
-LINE_EVERY = float(os.environ.get("VELAP_LINE_EVERY", "15"))
+LINE_EVERY = 15.0
 """Seconds between progress lines where the output is no terminal [s]."""
 
 
@@ -24,9 +21,7 @@ class View:
     """A progress bar with a text beside it; where the output is no terminal, a line now and then and one at the end."""
 
     def __init__(self, console: Console, title: str, total: int) -> None:
-        self._console = console
-        self._title = title
-        self._total = total
+        self._console, self._title, self._total = console, title, total
         self._last_line = time.monotonic()
         self._first: tuple[int, float] | None = None
         self._bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
@@ -34,12 +29,12 @@ class View:
                              disable=not console.is_terminal)
         self._task = self._bar.add_task(title, total=total, info="")
 
-    def show(self, done: int, info: str = "", title: str | None = None) -> None:
+    def show(self, done: int, info: str = "", title: str | None = None, total: int | None = None) -> None:
         """`done` of the total, with a text."""
-        self._title = title or self._title
-        self._bar.update(self._task, completed=done, info=info, description=self._title)
+        self._title, self._total = title or self._title, total or self._total
+        self._bar.update(self._task, completed=done, total=self._total, info=info, description=self._title)
         now = time.monotonic()
-        if self._first is None:
+        if self._first is None or done < self._first[0]:
             self._first = (done, now)
         if not self._console.is_terminal and (done == self._total or now - self._last_line >= LINE_EVERY):
             self._last_line = now
@@ -62,31 +57,16 @@ class View:
         self._bar.stop()
 
 
-class TrainView:
-    """Shows the steps and losses of training runs, one after the other; a total is known with the first report."""
+class TrainView(View):
+    """Steps and losses of training runs, one after the other; each report brings its total."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._view: View | None = None
-        self._shown: TrainProgress | None = None
+        super().__init__(console, "training", 1)
 
     def __call__(self, progress: TrainProgress) -> None:
         """One report of the training loop."""
-        if self._shown is not None and (progress.total != self._shown.total or progress.step < self._shown.step):
-            self.close()
-        if self._view is None:
-            self._view = View(self._console, "training", progress.total).__enter__()
-        self._shown = progress
         losses = "  ".join(f"{name.removeprefix('loss/')} {value:.3g}" for name, value in list(progress.info.items())[:6])
-        joint = progress.phase in dict(TrainConfig().phases)
-        title = f"training, {progress.phase} phase" if joint else f"learning {progress.phase}"
-        self._view.show(progress.step, losses, title)
-
-    def close(self) -> None:
-        """Stop drawing."""
-        if self._view is not None:
-            self._view.__exit__(None, None, None)
-            self._view = None
+        self.show(progress.step, losses, f"training, {progress.phase}", progress.total)
 
 
 class EpisodeView(View):
@@ -94,9 +74,7 @@ class EpisodeView(View):
 
     def __init__(self, console: Console, title: str, total: int) -> None:
         super().__init__(console, title, total)
-        self._episodes = 0
-        self._solved = 0
-        self._steps = 0
+        self._episodes = self._solved = self._steps = 0
 
     def step(self, row: int) -> None:
         """One more environment step of `row`; shown with row 0, between the episodes' ends."""

@@ -221,6 +221,14 @@ def _free_name(path: Path) -> Path:
     return path.with_name(f"{path.name}.old-{number}")
 
 
+def check_config(path: Path, config_hash: str) -> None:
+    """Raises RecordError where a file already holds records of another config: better before a training than after it."""
+    found = {record.config_hash for record in read_records(path)} if path.exists() else {config_hash}
+    if found - {config_hash}:
+        raise RecordError(f"{path} holds records of another config ({', '.join(sorted(found))}, now {config_hash}). Give "
+                          "--fresh to move that file aside, or other --records.")
+
+
 def read_all(root: Path) -> dict[Path, list[Record]]:
     """Every record file below `root` with its records, in the order of their names."""
     return {path: read_records(path) for path in sorted(root.rglob("*.jsonl"))}

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Table
 from scipy.stats import binomtest
 
 from velap.errors import RecordError
@@ -18,9 +16,11 @@ from velap.runs import write_atomic
 
 TABLE_START = "<!-- velap table: start -->"
 TABLE_END = "<!-- velap table: end -->"
+Episodes = Mapping[tuple[int, int], bool]
+"""(training seed, episode seed) -> success."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Summary:
     """What the records of one run say."""
 
@@ -37,6 +37,8 @@ class Summary:
     """Mean length of all episodes, failed ones included [steps]."""
     mean_success_steps: float
     """Mean length of the successful episodes, NaN without any [steps]."""
+    mean_plans: float
+    """Mean number of plans an episode."""
     plan_ms_p50: float
     """Median planning time, NaN where nothing was planned [ms]."""
     plan_ms_p95: float
@@ -68,10 +70,52 @@ def summarise(records: Sequence[Record]) -> Summary:
         episodes=len(records), successes=successes, wilson_low=low, wilson_high=high,
         mean_steps=float(np.mean([record.steps for record in records])),
         mean_success_steps=float(np.mean(succeeded)) if succeeded else math.nan,
+        mean_plans=len(plans) / len(records),
         plan_ms_p50=float(np.percentile(plans, 50)) if len(plans) else math.nan,
         plan_ms_p95=float(np.percentile(plans, 95)) if len(plans) else math.nan,
         code_versions=tuple(sorted({record.code_version for record in records})),
     )
+
+
+def mean_and_spread(rates: Sequence[float]) -> tuple[float, float]:
+    """Mean and sample standard deviation (n - 1) over training seeds, in the unit of `rates`; the spread of one is NaN."""
+    if not rates:
+        raise RecordError("there are no runs to average; run `velap table 1` first.")
+    return float(np.mean(rates)), float(np.std(rates, ddof=1)) if len(rates) > 1 else math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paired:
+    """McNemar's exact test of two methods on the same episodes."""
+
+    episodes: int
+    """Pairs."""
+    only_first: int
+    """Solved by the first method and not by the second."""
+    only_second: int
+    p_value: float
+    """Two-sided; 1 where no pair is discordant."""
+
+    @property
+    def discordant(self) -> int:
+        """Pairs in which exactly one method succeeds: the test rests on them alone."""
+        return self.only_first + self.only_second
+
+
+def mcnemar(first: Episodes, second: Episodes) -> Paired:
+    """Compare two methods on the episodes that both have; raises RecordError where they share none.
+
+    Exact form: under equal success rates each discordant pair falls to either side with probability 1/2.
+    """
+    shared = first.keys() & second.keys()
+    if not shared:
+        raise RecordError("the two methods have no episode of the same training and episode seed; evaluate both on the same "
+                          "seeds.")
+    only_first = sum(first[key] and not second[key] for key in shared)
+    only_second = sum(second[key] and not first[key] for key in shared)
+    discordant = only_first + only_second
+    p_value = float(binomtest(only_first, discordant, 0.5).pvalue) if discordant else 1.0
+    return Paired(episodes=len(shared), only_first=only_first, only_second=only_second, p_value=p_value)
 
 
 COLUMNS = ("task", "method", "preset", "train seed", "episodes", "success [%] (95 % interval)", "steps: solved / all",
@@ -90,45 +134,38 @@ def cells(summary: Summary) -> tuple[str, ...]:
             f"{number(summary.plan_ms_p50)} / {number(summary.plan_ms_p95)}")
 
 
-def rich_table(summaries: Iterable[Summary]) -> Table:
-    """The table of several runs for a terminal."""
-    table = Table(*map(escape, COLUMNS))
-    for summary in summaries:
-        table.add_row(*map(escape, cells(summary)))
-    return table
-
-
-def summary_table(summary: Summary) -> Table:
-    """One run for a terminal, a line a number."""
-    table = Table(show_header=False)
-    for name, cell in zip(COLUMNS, cells(summary), strict=True):
-        table.add_row(escape(name), escape(cell))
-    return table
+def summary_text(summary: Summary) -> str:
+    """One run, a line a number."""
+    width = max(map(len, COLUMNS))
+    return "\n".join(f"{name:{width}}  {cell}" for name, cell in zip(COLUMNS, cells(summary), strict=True))
 
 
 def markdown_table(summaries: Iterable[Summary]) -> str:
-    """The table for a document."""
-    return markdown_rows(COLUMNS, (cells(summary) for summary in summaries))
+    """A line a run, for documents, terminals and log files alike."""
+    return markdown_rows(COLUMNS, [cells(summary) for summary in summaries])
 
 
-def markdown_rows(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [columns, ("---",) * len(columns), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+def markdown_rows(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table whose columns stand below each other."""
+    widths = [max(3, *(len(line[index]) for line in (columns, *rows))) for index in range(len(columns))]
+    lines = [columns, ["-" * width for width in widths], *rows]
+    return "\n".join("| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |"
+                     for line in lines)
 
 
 def summarise_all(root: Path) -> list[Summary]:
     """A summary of every record file below `root`, sorted by task, method, preset and training seed."""
     files = {path: records for path, records in read_all(root).items() if records}
     if not files:
-        raise RecordError(f"there are no records below {root}; run `velap evaluate TASK --checkpoint F` first.")
+        raise RecordError(f"there are no records below {root}; run `velap evaluate TASK --checkpoint F` first, or name "
+                          "another folder with --records.")
     summaries = [summarise(records) for records in files.values()]
     return sorted(summaries, key=lambda summary: (summary.task, summary.method, summary.preset, summary.train_seed))
 
 
 def write_into(document: Path, table: str) -> None:
     """Replace what stands between the two table marks of `document`."""
-    text = document.read_text()
+    text = document.read_text() if document.is_file() else ""
     if text.count(TABLE_START) != 1 or text.count(TABLE_END) != 1:
         raise RecordError(f"{document} has no place for the table; put the lines {TABLE_START!r} and {TABLE_END!r} where it "
                           "belongs.")

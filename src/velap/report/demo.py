@@ -15,7 +15,7 @@ from velap.evaluation.console import EpisodeView
 from velap.evaluation.evaluate import Evaluation, Player, load_player, to_record
 from velap.evaluation.records import Record
 from velap.evaluation.rollout import Episode
-from velap.evaluation.summary import Summary, summarise, summary_table
+from velap.evaluation.summary import Summary, summarise, summary_text
 from velap.methods.base import Agent
 from velap.methods.velap import VelapAgent
 from velap.report.figures import LatentMap, plan_figure
@@ -61,7 +61,8 @@ def released_checkpoint(task: str) -> Path:
                           f"`velap run {task}`, or name one with --checkpoint.")
 
 
-def run_demo(console: Console, task: str, checkpoint: Path | None, episodes: int, out: Path, device: str) -> Summary:
+def run_demo(console: Console, task: str, *, checkpoint: Path | None = None, episodes: int = 10, out: Path,
+             device: str = "auto") -> Summary:
     """Play test episodes 0 ... `episodes` - 1 at once; writes `episodes.mp4` and `plan.png` into `out`."""
     path = checkpoint or released_checkpoint(task)
     player = load_player(Evaluation(task, checkpoint=path, device=device))
@@ -70,7 +71,7 @@ def run_demo(console: Console, task: str, checkpoint: Path | None, episodes: int
         latent_map = latent_map_of(player)
     first_plan = FirstPlan(0)
     summary = summarise(_play(console, player, episodes, out / "episodes.mp4", latent_map, first_plan))
-    console.print(summary_table(summary))
+    console.print(summary_text(summary), markup=False, soft_wrap=True)
     console.print(f"video {out / 'episodes.mp4'}", markup=False)
     if latent_map is not None and first_plan.draw(latent_map, out / "plan.png"):
         console.print(f"picture {out / 'plan.png'}", markup=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,7 +57,7 @@ LONGEST = 20
 PAGE = "report.md"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Request:
     """What to diagnose."""
 
@@ -76,9 +76,12 @@ class Request:
     """Config fields to replace."""
     env: str | None = None
     """Gymnasium id instead of the task's own."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
     image_key: str | None = None
     max_steps: int | None = None
-    """Time limit where the environment has none [steps]."""
+    """Time limit where the environment has none, or a shorter one [steps]."""
+    success_reward: float | None = None
+    """Least reward that means success."""
     command: str = "velap diagnose"
 
 
@@ -143,8 +146,9 @@ def resolve(request: Request) -> _Subject:
     evaluation = None
     if env is not None or task in TASKS:
         changes = dict(request.changes or {})
-        evaluation = Evaluation(task, checkpoint=checkpoint, env=env, image_key=request.image_key,
-                                max_steps=request.max_steps, device=request.device, changes=changes)
+        evaluation = Evaluation(task, checkpoint=checkpoint, env=env, env_kwargs=request.env_kwargs,
+                                image_key=request.image_key, max_steps=request.max_steps,
+                                success_reward=request.success_reward, device=request.device, changes=changes)
     return _Subject(task, checkpoint, dataset_id, evaluation)
 
 

@@ -38,8 +38,5 @@ TABLE_1 = {(task, method): Published(*cell)
            for task, row in _ROWS.items() for method, cell in zip(METHODS, row, strict=True)}
 """(task, method) -> what the paper reports."""
 
-LABELS = {
-    "bc": "BC", "bc-success": "BC (D*)", "td3bc": "TD3-BC", "iql": "IQL", "iql-sparse": "IQL (0.9 / 10)", "mppi": "MPPI",
-    "mbop": "MBOP", "iris": "IRIS", "iris-multistep": "IRIS (multi-step)", "velap": "VELAP", "random": "random",
-}
-"""How tables name the methods, in the order of their rows: those of Table 1 and, beside them, ours."""
+ROWS = ("bc", "bc-success", "td3bc", "iql", "iql-sparse", "mppi", "mbop", "iris", "iris-multistep", "velap", "random")
+"""Methods in the order of our tables' rows: those of Table 1 and, beside them, ours."""

@@ -1,0 +1,118 @@
+"""`velap table`, `velap bench`, `velap study` and `velap figure`; all but the table of all records need a checkout."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from velap.cli.options import OUT, Device, Settings, say
+from velap.cli.settings import parse_settings
+from velap.errors import ConfigError
+from velap.storage import OWN_RECORDS, SHIPPED_RECORDS
+
+
+def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make Table 1 of the paper.")] = None,
+          records: Path | None = None, write: Path | None = None, only: tuple[str, ...] = (), jobs: int = 2,
+          dry_run: bool = False, no_run: bool = False, fresh: bool = False, episodes: int = 100, batch: int = 1) -> None:
+    """Print the statistics of all records; with `1`, run whatever Table 1 still lacks and write it.
+
+    `velap table 1` collects, trains and evaluates every cell that has no records of today's config. Interrupt it at any
+    time: the same command goes on from there.
+
+    Args:
+        records: Root of the episode records; runs/records unless said, with `1` those of the published tables in
+            results/records.
+        write: Document to update between its table marks, such as docs/records.md; with `1` docs/results.md, or another one
+            to write.
+        only: Cells to run, such as `task=SpiralMaze method=bc,iql`. Axes are task, method, preset and seed; unless said all
+            tasks, all methods, preset=default and seed=0.
+        jobs: Jobs at once, on one machine; each gets its share of the cores.
+        dry_run: Only say what is there, what is missing and which jobs would run.
+        no_run: Only write the table from the records that are there.
+        fresh: Move runs and records of another config aside and make them anew; their cells fail otherwise.
+        episodes: Test episodes of a cell, seeds from 0.
+        batch: Episodes at once; one by one, an interruption loses one episode at most.
+    """
+    if number is None:
+        if only or dry_run or no_run or fresh or (jobs, episodes, batch) != (2, 100, 1):
+            raise ConfigError("got options of `velap table 1` without the number; expected `velap table 1 ...`, or only "
+                              "--records and --write.")
+        from velap.evaluation.summary import markdown_table, summarise_all, write_into
+
+        text = markdown_table(summarise_all(records or OWN_RECORDS))
+        if write is None:
+            say(text)
+        else:
+            write_into(write, text)
+            say(f"table written into {write}")
+        return
+    one = _study("table1.workflow").Table1(
+        cells=_study("table1.cells").parse_only(only), only=" ".join(only), records=records or SHIPPED_RECORDS,
+        episodes=episodes, batch=batch, jobs=jobs, fresh=fresh, page=write or Path("docs/results.md"))
+    do = one.dry_run if dry_run else one.write if no_run else one.run
+    do(OUT)
+
+
+def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device = "auto") -> None:
+    """Measure the speed ratios side by side and print them.
+
+    Args:
+        json: Write them to this file as well, such as results/bench/cpu.json.
+        only: Names of the benchmarks to measure, such as plan_latency_1; all unless said.
+    """
+    _study("speed").run_benchmarks(OUT, json, device, only)
+
+
+def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-latents"]],
+                             arg(help="`faults`: kills, damage, full disks. `experts`: can each task be solved, and not by "
+                                      "chance. `exact-latents`: what everything but the encoder can do.")],
+          quick: bool = False, seed: int = 0, write: Path | None = None, json: Path | None = None,
+          task: str = "DrawerButton", settings: Settings = ()) -> None:
+    """Try what may go wrong, whether the tasks can be solved, or true states instead of latents of frames.
+
+    Args:
+        quick: Two kills a command instead of twenty; ten episodes instead of a hundred (fifty on exact latents).
+        seed: Decides the moments of the kills; seed of the experts' first episode; training seed of exact latents.
+        task: Manipulation task of exact latents.
+        write: Document to write, such as docs/faults.md or docs/experts.md.
+        json: Figures of the experts go to this file as well, such as results/experts.json.
+    """
+    if subject == "faults":
+        _study("faults.study").study_faults(OUT, quick, seed, write)
+    elif subject == "exact-latents":
+        _study("exact_latents").study_exact_latents(OUT, task, parse_settings(settings), seed, quick, json)
+    else:
+        _study("experts").study_experts(OUT, quick, seed, write, json)
+
+
+def figure(name: Annotated[Positional[Literal["tasks", "sawyer-drawing"]], arg(help="What to draw.")],
+           write: Path | None = None) -> None:
+    """Draw a picture of the documentation anew.
+
+    `tasks`: test start and goal state of every task, as an agent sees them. `sawyer-drawing`: our drawing of the arm beside
+    Meta-World's geometry.
+
+    Args:
+        write: Where it goes; docs/NAME.png (with _ for -) unless said.
+    """
+    path = write or Path("docs") / f"{name.replace('-', '_')}.png"
+    if name == "tasks":
+        _study("gallery").show_tasks(OUT, path)
+    else:
+        _study("drawing").show_drawing(OUT, path)
+
+
+def _study(name: str) -> ModuleType:
+    """Module `studies.name` of the checkout that this package runs from; the installed package does without the studies."""
+    checkout = Path(__file__).resolve().parents[3]
+    if not (checkout / "studies").is_dir():
+        raise ConfigError(f"found no folder `studies` in {checkout}; expected a checkout of velap. "
+                          "Clone the repository and install it with `pip install -e .`.")
+    if str(checkout) not in sys.path:
+        sys.path.append(str(checkout))
+    return import_module(f"studies.{name}")

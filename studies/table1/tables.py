@@ -1,0 +1,252 @@
+"""Table 1 from records: a data frame with a row a training seed, and the CSV, LaTeX and Markdown made of it.
+
+Statistics are `velap.evaluation.summary`'s. Records of another config are left out and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from studies.table1.cells import METHOD_ORDER, TASK_ORDER, Cell, look, training_seconds
+from studies.table1.paper import TABLE_1
+from velap.evaluation.records import select
+from velap.evaluation.summary import Episodes, mcnemar, mean_and_spread, summarise
+from velap.methods.base import get_method
+from velap.models.velap import WEIGHTS_SHA256, shared_weights
+from velap.tasks import PRESETS
+
+MISSING = "–"
+"""A cell without records."""
+NO_BASELINES = ("velap", "random")
+"""Methods that are not among those that VELAP is compared with."""
+KEY = ["task", "method", "preset"]
+NUMBERS = ["episodes", "successes", "success_percent", "wilson_low_percent", "wilson_high_percent"]
+SPREAD = ["seeds", "mean_percent", "spread_percent", "paper_percent", "paper_deviation_percent"]
+COST = ["mean_steps", "plan_ms_p50", "plan_ms_p95", "training_seconds"]
+ORIGIN = ["config_hash", "checkpoint", "code_versions", "records"]
+CSV_COLUMNS = [*KEY, "train_seed", *NUMBERS, *SPREAD, *COST, *ORIGIN]
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything that the table says."""
+
+    runs: pd.DataFrame
+    """A row a training seed, and one without numbers for each cell that has no records; columns `CSV_COLUMNS`, `plans`,
+    `schema` and `outcomes`."""
+    notes: tuple[str, ...]
+    """What was left out, and what is mixed."""
+
+    @property
+    def presets(self) -> list[str]:
+        """Presets in the table."""
+        return list(dict.fromkeys(self.runs["preset"]))
+
+    def of(self, preset: str) -> pd.DataFrame:
+        """The rows of one preset."""
+        return self.runs[self.runs["preset"] == preset]
+
+
+def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> Results:
+    """Read all records that belong to the table; `presets` are shown even where nothing is recorded of them."""
+    rows: list[dict[str, Any]] = []
+    notes: list[str] = []
+    for preset in PRESETS:
+        for task in TASK_ORDER:
+            for method in METHOD_ORDER:
+                found = list(_runs(Cell(task, method, preset, 0), root, episodes, notes))
+                rows += found or [dict(zip(KEY, (task, method, preset), strict=True))]
+    runs = pd.DataFrame(rows, columns=[*CSV_COLUMNS, "plans", "schema", "outcomes"])
+    recorded = set(runs[runs["episodes"].notna()]["preset"])
+    runs = runs[runs["preset"].isin(recorded | set(presets))].copy()
+    for number, row in runs.iterrows():
+        rates = runs[(runs[KEY] == row[KEY]).all(axis=1)]["success_percent"].dropna()
+        mean, spread = mean_and_spread(list(rates)) if len(rates) else (None, None)
+        paper = TABLE_1.get((row["task"], row["method"]))
+        reported = (None, None) if paper is None else (paper.mean, paper.deviation)
+        runs.loc[number, SPREAD] = [len(rates), mean, spread, *reported]
+    whole = ["train_seed", "episodes", "successes", "seeds", "paper_percent", "paper_deviation_percent"]
+    real = [name for name in (*NUMBERS, *SPREAD, *COST) if name not in whole]
+    runs = runs.astype(dict.fromkeys(whole, "Int64") | dict.fromkeys(real, float))
+    return Results(runs, (*notes, *_batches(runs), *_mixed_code(runs), *_mixed_checkpoints(runs), *_missing(runs)))
+
+
+def _runs(cell: Cell, root: Path, episodes: int, notes: list[str]) -> Iterator[dict[str, Any]]:
+    """A row for each training seed whose records are whole and of today's config; the others are noted."""
+    files = sorted(cell.records(root).parent.glob("train*.jsonl"), key=lambda path: (len(path.name), path.name))
+    for path in (path for path in files if path.stem.removeprefix("train").isdecimal()):
+        run = Cell(cell.task, cell.method, cell.preset, int(path.stem.removeprefix("train")))
+        state = look(run, root, episodes)
+        if state.problem or state.done < episodes:
+            why = state.problem or f"only {state.done} of {episodes} episodes are recorded"
+            notes.append(f"{path} is left out: {why}.")
+            continue
+        records = select(state.records, range(episodes))
+        summary = summarise(records)
+        yield {
+            "task": run.task, "method": run.method, "preset": run.preset, "train_seed": run.seed,
+            "episodes": summary.episodes, "successes": summary.successes, "success_percent": 100 * summary.success_rate,
+            "wilson_low_percent": 100 * summary.wilson_low, "wilson_high_percent": 100 * summary.wilson_high,
+            "mean_steps": summary.mean_steps, "plan_ms_p50": summary.plan_ms_p50, "plan_ms_p95": summary.plan_ms_p95,
+            "training_seconds": training_seconds(run), "config_hash": records[0].config_hash,
+            "checkpoint": records[0].checkpoint, "code_versions": " ".join(summary.code_versions), "records": str(path),
+            "plans": summary.mean_plans, "schema": min(record.schema for record in records),
+            "outcomes": {(run.seed, record.episode_seed): record.success for record in records}}
+
+
+def to_csv(results: Results) -> str:
+    """A line a training seed of every cell; a missing cell has a line without numbers."""
+    return results.runs.to_csv(columns=CSV_COLUMNS, index=False, float_format="%.3f", lineterminator="\n")
+
+
+def success(runs: pd.DataFrame) -> str:
+    """`97.0 (91.5 to 99.0)` of one training seed, `95.5 ± 2.1 (2 seeds)` of several [%]."""
+    first = runs.iloc[0]
+    if first["seeds"] == 0:
+        return MISSING
+    if first["seeds"] > 1:
+        return f"{first['mean_percent']:.1f} ± {first['spread_percent']:.1f} ({first['seeds']} seeds)"
+    return f"{first['mean_percent']:.1f} ({first['wilson_low_percent']:.1f} to {first['wilson_high_percent']:.1f})"
+
+
+def published(task: str, method: str) -> str:
+    """`94 ± 3` [%] of the paper; a dash for methods that it does not have."""
+    cell = TABLE_1.get((task, method))
+    return MISSING if cell is None else f"{cell.mean} ± {cell.deviation}"
+
+
+def matrix(runs: pd.DataFrame) -> pd.DataFrame:
+    """Text of each cell of one preset: methods × tasks."""
+    cells = {(task, method): success(group) for (task, method), group in runs.groupby(["task", "method"])}
+    return pd.DataFrame({task: {method: cells[task, method] for method in METHOD_ORDER} for task in TASK_ORDER})
+
+
+def to_markdown(runs: pd.DataFrame) -> str:
+    """Methods × tasks of one preset, the paper's figure below each of ours [%]."""
+    cells = matrix(runs)
+    for task in cells:
+        cells[task] += [f"<br>paper {published(str(task), method)}" for method in cells.index]
+    cells.index = pd.Index([f"**{get_method(method).label}**" for method in cells.index], name="method")
+    return cells.to_markdown()
+
+
+def to_latex(runs: pd.DataFrame, preset: str) -> str:
+    """The table in the paper's shape: a row a task with ours, the best in bold, and the paper's below; needs booktabs."""
+    ours = matrix(runs).T.map(_latex)
+    best = runs.groupby("task")["mean_percent"].max()
+    for (task, method), group in runs.groupby(["task", "method"]):
+        if group["mean_percent"].iloc[0] == best[task] > 0:
+            ours.loc[task, method] = f"\\textbf{{{ours.loc[task, method]}}}"
+    paper = pd.DataFrame({method: {f"\\quad paper {task}": _latex(published(task, method)) for task in ours.index}
+                          for method in ours.columns})
+    both = pd.concat([ours, paper]).loc[[row for task in ours.index for row in (task, f"\\quad paper {task}")]]
+    both.columns = pd.Index([_latex(get_method(method).label) for method in both.columns])
+    both.index = pd.Index([row if row in ours.index else "\\quad paper" for row in both.index])
+    note = f"% Generated by `velap table 1` from the episode records, preset {preset}. Needs \\usepackage{{booktabs}}.\n"
+    return note + both.to_latex(column_format="l" + "c" * both.shape[1])
+
+
+def _latex(text: str) -> str:
+    """Plain text with what LaTeX takes for commands spelt out."""
+    for plain, escaped in (("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$"), ("*", r"$^*$"), (MISSING, "--")):
+        text = text.replace(plain, escaped)
+    return text
+
+
+def planning(runs: pd.DataFrame) -> pd.DataFrame:
+    """How much VELAP plans on each task of one preset, and what it costs; means over the training seeds."""
+    velap = runs[(runs["method"] == "velap") & runs["episodes"].notna()]
+    means = velap.groupby("task")[["plans", "plan_ms_p50", "plan_ms_p95", "mean_steps", "training_seconds"]].mean()
+    means["training_seconds"] /= 60
+    means.columns = pd.Index(["plans an episode", "plan p50 [ms]", "plan p95 [ms]", "steps an episode", "training [min]"])
+    means = means.reindex([task for task in TASK_ORDER if task in means.index])
+    return means.map(lambda value: MISSING if pd.isna(value) else f"{value:.1f}")
+
+
+def comparisons(results: Results) -> pd.DataFrame:
+    """VELAP against the baseline with the highest mean rate, the first in the paper's order among equals (McNemar)."""
+    rows = []
+    for preset in results.presets:
+        for task in TASK_ORDER:
+            group = results.of(preset)
+            group = group[(group["task"] == task) & group["episodes"].notna()]
+            velap = _outcomes(group, "velap")
+            rivals = [method for method in METHOD_ORDER if method not in NO_BASELINES
+                      and _outcomes(group, method).keys() & velap.keys()]
+            if not rivals:
+                continue
+            rates = group.groupby("method")["mean_percent"].first()
+            best = max(rivals, key=lambda method: rates[method])
+            test = mcnemar(velap, _outcomes(group, best))
+            rows.append({"task": task, "preset": preset, "best baseline": get_method(best).label,
+                         "VELAP [%]": f"{rates['velap']:.1f}", "baseline [%]": f"{rates[best]:.1f}", "pairs": test.episodes,
+                         "discordant": test.discordant,
+                         "only VELAP / only baseline": f"{test.only_first} / {test.only_second}",
+                         "p (McNemar, exact)": "< 0.001" if test.p_value < 0.001 else f"{test.p_value:.3f}"})
+    return pd.DataFrame(rows)
+
+
+def _outcomes(runs: pd.DataFrame, method: str) -> Episodes:
+    """Success of every episode of a method, all training seeds of these rows."""
+    return {key: won for outcomes in runs[runs["method"] == method]["outcomes"] for key, won in outcomes.items()}
+
+
+def _batches(runs: pd.DataFrame) -> Iterator[str]:
+    """VELAP's records from before rows became independent."""
+    old = runs[(runs["method"] == "velap") & (runs["schema"] == 1)]
+    if len(old):
+        yield (f"{len(old)} record files of VELAP do not name their batch. They were made in batches of 10 to 25 by code in "
+               "which an episode of VELAP depended on the others of its batch; commit b52d38f mended that.")
+
+
+def _mixed_code(runs: pd.DataFrame) -> Iterator[str]:
+    """Files whose episodes come from several versions of the code, or from changes that no commit holds."""
+    recorded = runs[runs["episodes"].notna()]
+    for path, versions in zip(recorded["records"], recorded["code_versions"].str.split(), strict=True):
+        if len(versions) > 1:
+            yield f"{path} holds episodes of {len(versions)} versions of the code: {', '.join(versions)}."
+    dirty = list(recorded[recorded["code_versions"].str.contains(r"\.dirty", na=False)]["records"])
+    if dirty:
+        yield (f"{len(dirty)} files were recorded, wholly or in part, with uncommitted changes of the code: "
+               f"{', '.join(dirty)}.")
+
+
+def _mixed_checkpoints(runs: pd.DataFrame) -> Iterator[str]:
+    """Methods of one task, preset and training seed that do not share their joint checkpoint."""
+    recorded = runs[runs["episodes"].notna() & (runs["method"] != "random")]
+    for (task, preset, seed), group in recorded.groupby(["task", "preset", "train_seed"], sort=False):
+        by: dict[str, list[str]] = {}
+        for method, checkpoint in zip(group["method"], group["checkpoint"], strict=True):
+            weights = _shared(Cell(task, method, preset, int(seed)), checkpoint)
+            if weights:
+                by.setdefault(weights, []).append(method)
+        if len(by) > 1:
+            yield (f"{task} {preset} seed {seed}: the methods do not share one joint checkpoint: "
+                   + "; ".join(f"{weights[:12]} {', '.join(methods)}" for weights, methods in sorted(by.items())) + ".")
+
+
+def _shared(cell: Cell, checkpoint: str) -> str:
+    """The weights that a method has in common with the others; empty where the checkpoint that could tell is not here.
+
+    VELAP's records name all of its weights, some of which are its own.
+    """
+    if not get_method(cell.method).whole_checkpoint:
+        return checkpoint
+    metadata = cell.joint
+    if metadata is None:
+        return ""
+    return shared_weights(metadata) if metadata.get(WEIGHTS_SHA256) == checkpoint else checkpoint
+
+
+def _missing(runs: pd.DataFrame) -> Iterator[str]:
+    """How many cells of each preset are empty."""
+    for preset, group in runs.groupby("preset", sort=False):
+        empty = int((group["seeds"] == 0).sum())
+        if empty:
+            total = len(group.drop_duplicates(KEY))
+            yield f"{empty} of {total} cells of preset {preset} are missing."
