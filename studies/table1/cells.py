@@ -16,7 +16,6 @@ from studies.table1.paper import ROWS
 from studies.table1.paper import TASKS as PAPER_TASKS
 from velap.config import Config
 from velap.data import minari_io
-from velap.data.behaviours import mixture
 from velap.errors import ConfigError, RecordError, UnknownTaskError
 from velap.evaluation.records import Record, read_records, record_path
 from velap.methods.base import get_method
@@ -234,7 +233,7 @@ def dataset_problem(task: str) -> str:
     if plan is None:
         return "velap did not collect the dataset there"
     recipe = dataclasses.asdict(get_task(task).recipe)
-    wanted = {"task": task, "seed": DATASET_SEED, "recipe": recipe, "shares": mixture(task)}
+    wanted = {"task": task, "seed": DATASET_SEED, "recipe": recipe, "shares": get_task(task).shares}
     defaults = {each.name: each.default for each in dataclasses.fields(Recipe) if each.default is not dataclasses.MISSING}
     found = {**plan, "recipe": {**defaults, **plan.get("recipe", {})}}  # older datasets lack younger fields
     wrong = [name for name, value in wanted.items() if found.get(name) != json.loads(json.dumps(value))]
