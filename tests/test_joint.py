@@ -10,7 +10,7 @@ import torch
 
 from velap.config import Config, ModelConfig
 from velap.config.training import TrainConfig
-from velap.data.frames import FrameStore
+from velap.data.frames import FrameStore, Reading
 from velap.errors import CheckpointError, ConfigError, DatasetError
 from velap.models.velap import load_checkpoint
 from velap.runs import load_tensors
@@ -360,6 +360,7 @@ def test_train_writes_a_loadable_model_and_readable_metrics(tmp_path):
     result = train(config(), make_store(), tmp_path, device="cpu", on_progress=seen.append, command="velap train test")
     model, loaded, metadata = load_checkpoint(result.checkpoint)
     assert loaded == config() and metadata["command"] == "velap train test" and metadata["dataset_hash"] == "abc"
+    assert Reading.from_json(metadata["reading"]) == make_store().reading
     assert result.checkpoint.name == MODEL and model.step_distance > 0 and (model.bank_rows >= 0).all()
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [2, 4, 6, 8, 10, 12]

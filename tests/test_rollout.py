@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from toy_env import SIDE, ToyEnv, ToyModel, toy_config, toy_env
+from velap.data.success import Success
 from velap.errors import ConfigError, DatasetError
-from velap.evaluation.rollout import Episode, FrameReader, Rollout, make_envs, succeeded
+from velap.evaluation.rollout import Episode, FrameReader, Rollout, make_envs
 from velap.methods.base import Agent, make_agent
 from velap.methods.random import RandomAgent
 
@@ -84,24 +85,19 @@ def test_max_steps_ends_an_episode_as_truncated() -> None:
     assert (episode.steps, episode.truncated, episode.success) == (7, True, False)
 
 
-@pytest.mark.parametrize(("reward", "info", "expected"), [
-    (1.0, {}, True), (0.0, {}, False), (1.0, {"success": False}, False), (0.0, {"is_success": True}, True),
-])
-def test_success_is_the_environments_word(reward: float, info: dict[str, Any], expected: bool) -> None:
-    assert succeeded(reward, info) is expected
+@pytest.mark.parametrize(("rule", "steps"), [(None, 20), ("reward>=-1", 1), ("info:steps>=3", 3), ("reward>=0.5", 20)])
+def test_success_is_what_the_rule_of_the_checkpoint_says(rule: str | None, steps: int) -> None:
+    class Walk(ToyEnv):
+        def step(self, action: np.ndarray) -> Any:
+            observation, *_ = super().step(action)
+            self.taken = getattr(self, "taken", 0) + 1
+            return observation, -1.0 if rule else 0.0, False, False, {"steps": self.taken}
 
-
-@pytest.mark.parametrize(("reward", "least", "expected"), [(-1.0, 0.0, False), (0.0, 0.0, True), (0.1, 1.0, False),
-                                                           (1.0, 1.0, True)])
-def test_success_is_a_reward_of_at_least_what_is_said(reward: float, least: float, expected: bool) -> None:
-    assert succeeded(reward, {}, least) is expected
-    assert succeeded(reward, {"success": not expected}, least) is not expected, "what the environment says comes first"
-
-
-def test_a_negative_reward_does_not_tell_what_success_is() -> None:
-    with pytest.raises(ConfigError, match="--success-reward 0"):
-        succeeded(-1.0, {})
-    assert succeeded(-1.0, {"is_success": True}) is True
+    env = Walk()
+    agent = RandomAgent(env.action_space, 1)
+    rollout = Rollout([env], agent, FrameReader(env, SIDE), max_steps=20, success=rule and Success.parse(rule))
+    (episode,) = rollout.run([0])
+    assert (episode.steps, episode.success) == (steps, steps < 20)
 
 
 class Foreign(gym.Env[Any, Any]):

@@ -22,6 +22,8 @@ from velap.storage import OWN_RECORDS, run_dir
 from velap.tasks import TASKS, get_task, make_config, task_of
 
 if TYPE_CHECKING:
+    from velap.data.images import Fit
+    from velap.data.success import Predicate
     from velap.evaluation.summary import Summary
     from velap.methods.base import Agent
     from velap.training.steps import Progress
@@ -57,20 +59,25 @@ def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwr
 
 def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Path | None = None, *,
           method: str = "velap", image_key: str | None = None, device: str = "auto", resume: bool = False,
-          changes: Changes | None = None, base: Path | None = None, command: str = "velap.train",
+          changes: Changes | None = None, base: Path | None = None, fit: Fit | None = None, image_size: int = 64,
+          success: str | Predicate | None = None, mapped: bool | None = None, command: str = "velap.train",
           on_progress: Callable[[Progress], None] = lambda progress: None) -> Path:
-    """Train on a task's dataset, or on any Minari dataset with images and a sparse reward; returns the joint checkpoint.
+    """Train on a task's dataset, or on any dataset of images and continuous actions; returns the joint checkpoint.
 
     All methods share the joint training, which is done first where its checkpoint is missing. What BC, IQL and IRIS learn on
     its latents lies beside it as `<method>.safetensors`, where `load` and `evaluate` find it.
 
     Args:
-        task_or_dataset: task name, or Minari dataset id.
+        task_or_dataset: task name, path of a dataset, or its id.
         preset: `default` or `paper`.
         seed: decides weights and batches.
         out: run directory; None takes `runs/<task>/<preset>/seed<seed>`.
         method: a name in `velap.registry.METHODS`.
         image_key: key of the image in dict observations.
+        fit: how oblong images become square: `crop`, `pad` or `squash`.
+        image_size: side that images are resized to [px].
+        success: what success is, a rule of `velap.data.success`; None finds one.
+        mapped: map the frames from a file beside the dataset; None does so where they would fill the memory.
         device: `auto`, `cpu` or `cuda`.
         resume: go on with the joint run in `out`; a finished one is left as it is. Heads always go on.
         changes: config fields to replace; under `head` those of the method's learner.
@@ -91,7 +98,8 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
     learner = kind.learner_config(preset, of_head) if kind.learns or of_head else None
     config = config_for(task, preset, changes)
     dataset_id = TASKS[task_or_dataset].dataset_id if task_or_dataset in TASKS else task_or_dataset
-    store = load_store(dataset_id, image_key, min_length=config.train.dynamics_horizon)
+    store = load_store(dataset_id, image_key, config.train.dynamics_horizon, image_size, fit=fit, success=success,
+                       mapped=mapped)
     directory = out or run_dir(task, preset, seed)
     checkpoint = directory / MODEL
     if method != "velap" and checkpoint.exists():

@@ -16,7 +16,9 @@ import torch
 import velap.envs  # noqa: F401 - registers the tasks
 from velap._version import __version__
 from velap.config import Config
+from velap.data.frames import Reading
 from velap.data.images import IMAGE_SIZE
+from velap.data.success import Success
 from velap.errors import ConfigError, UnknownTaskError
 from velap.evaluation.records import Record, RecordFile, RunKey, select
 from velap.evaluation.rollout import Episode, FrameReader, Observer, Rollout, make_envs
@@ -27,6 +29,10 @@ from velap.tasks import TASKS, get_task, make_config
 
 BATCH = 10
 """Environments that run at once. ours: plans are batched over them, more only cost memory."""
+
+
+AS_THE_TASKS = Reading()
+"""How the data of checkpoints were read that do not say it: square images, rewards 0 and 1."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,7 @@ class Evaluation:
     max_steps: int | None = None
     """Time limit [steps], where it is shorter than the environment's own or the environment has none."""
     success_reward: float | None = None
-    """Least reward that means success, for environments whose `info` does not tell; None takes any positive one."""
+    """Least reward that means success; None takes the rule that the checkpoint keeps."""
     device: str = "auto"
     changes: dict[str, dict[str, Any]] | None = None
     """Fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`, or of the method's own settings,
@@ -70,6 +76,19 @@ class Player:
     make_env: Callable[[], gym.Env[Any, Any]]
     image_size: int
     """Side of the images that the agent takes [px]."""
+    reading: Reading = AS_THE_TASKS
+    """How the data were read that the model learnt from."""
+
+    @property
+    def success(self) -> Success | None:
+        """What counts as success: the least reward asked for, else the rule that the checkpoint keeps."""
+        if self.key.success_reward is not None:
+            return Success("reward", least=self.key.success_reward)
+        return Success.parse(self.reading.success) if self.reading.success else None
+
+    def frames_of(self, env: gym.Env[Any, Any]) -> FrameReader:
+        """The reader of an environment's frames, which squares and resizes them as it was done with the data."""
+        return FrameReader(env, self.image_size, self.key.image_key, self.reading.fit)
 
     @property
     def device(self) -> str:
@@ -82,9 +101,8 @@ class Player:
     def rollout(self, batch: int, observer: Observer | None = None) -> Rollout:
         """A rollout over `batch` new environments."""
         envs = make_envs(self.make_env, batch)
-        reader = FrameReader(envs[0], self.image_size, self.key.image_key)
-        return Rollout(envs, self.agent, reader, reset_options=reset_options(envs[0]), max_steps=self.key.max_steps,
-                       success_reward=self.key.success_reward, observer=observer)
+        return Rollout(envs, self.agent, self.frames_of(envs[0]), reset_options=reset_options(envs[0]),
+                       max_steps=self.key.max_steps, success=self.success, observer=observer)
 
 
 def reset_options(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
@@ -107,7 +125,7 @@ def load_player(what: Evaluation) -> Player:
     env = make_env(env_id, what.env_kwargs)
     try:
         agent = make_agent(what.method, model, config, _checked_actions(env, model), loaded.head, loaded.settings)
-        FrameReader(env, size, what.image_key)
+        FrameReader(env, size, what.image_key, loaded.reading.fit)
         max_steps = _time_limit(env, what.max_steps)
     finally:
         env.close()
@@ -116,7 +134,7 @@ def load_player(what: Evaluation) -> Player:
                  max_steps=max_steps, success_reward=what.success_reward,
                  config_hash=method.config_hash(config, loaded.head, loaded.settings), checkpoint=loaded.digest,
                  code_version=code_version())
-    return Player(agent=agent, model=model, config=config, key=key, image_size=size,
+    return Player(agent=agent, model=model, config=config, key=key, image_size=size, reading=loaded.reading,
                   make_env=lambda: make_env(env_id, what.env_kwargs))
 
 
@@ -141,6 +159,7 @@ class _Loaded(NamedTuple):
     """Hash of the joint weights, for other methods than VELAP of those that all share."""
     head: Head | None = None
     settings: Any = None
+    reading: Reading = AS_THE_TASKS
 
 
 def _load_model(what: Evaluation) -> _Loaded:
@@ -166,7 +185,8 @@ def _load_model(what: Evaluation) -> _Loaded:
         head = load_head(what.head or head_path(what.checkpoint, what.method), metadata, device)
     seed = int(metadata.get("seed", 0))
     digest = metadata[WEIGHTS_SHA256] if method.whole_checkpoint else shared_weights(metadata)
-    return _Loaded(model, override(config, **changes), seed, digest, head, settings)
+    reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else AS_THE_TASKS
+    return _Loaded(model, override(config, **changes), seed, digest, head, settings, reading)
 
 
 def make_env(env_id: str, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, Any]:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap.data.frames import stack_indices
-from velap.data.images import find_image, to_rgb
+from velap.data.images import Fit, find_image, to_rgb
+from velap.data.success import Success, success_of
 from velap.errors import ConfigError
 from velap.methods.base import Agent
 
@@ -48,37 +49,19 @@ class Observer(Protocol):
 class FrameReader:
     """Observations of one environment -> images uint8 [side, side, 3], by the rules that datasets are read by."""
 
-    def __init__(self, env: gym.Env[Any, Any], side: int, image_key: str | None = None) -> None:
+    def __init__(self, env: gym.Env[Any, Any], side: int, image_key: str | None = None, fit: Fit | None = None) -> None:
+        """`fit` says how oblong images become square, as those of the dataset did."""
         self._name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
-        self._layout = find_image(env.observation_space, image_key, self._name, NO_PIXELS)
-        self._side = side
+        self._layout = find_image(env.observation_space, image_key, self._name, NO_PIXELS, fit)
+        self._side, self._fit = side, fit
 
     def __call__(self, observation: Any) -> NDArray[np.uint8]:
         """The image of one observation."""
-        for key in self._layout.key:
-            observation = observation[key]
-        image = np.asarray(observation)
-        if image.dtype != np.uint8 or image.shape != self._layout.shape:
+        image = self._layout.of(observation)
+        if image.dtype != self._layout.dtype or image.shape != self._layout.shape:
             raise ConfigError(f"{self._name} returned {image.dtype}{list(image.shape)}; its observation space promises "
-                              f"uint8{list(self._layout.shape)}. Mend the environment.")
-        return to_rgb(image[None], self._layout, self._side)[0]
-
-
-def succeeded(reward: float, info: dict[str, Any], least: float | None = None) -> bool:
-    """Success of a transition: what `info` says where it says it, else a reward of at least `least` (None: any positive).
-
-    Raises ConfigError for a negative reward without either: where every step costs, 0 may well be success.
-    """
-    for key in ("success", "is_success"):
-        if key in info:
-            return bool(info[key])
-    if least is not None:
-        return reward >= least
-    if reward < 0:
-        raise ConfigError(f"the environment gave the reward {reward:g} and no `success` in its info; expected 0, or a "
-                          "positive reward for success. Say which reward means success, such as --success-reward 0 for an "
-                          "environment that gives -1 a step and 0 at the goal.")
-    return reward > 0
+                              f"{self._layout.dtype}{list(self._layout.shape)}. Mend the environment.")
+        return to_rgb(image[None], self._layout, self._side, self._fit)[0]
 
 
 @dataclass
@@ -107,13 +90,13 @@ class Rollout:
 
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], agent: Agent, read: FrameReader, *,
                  reset_options: dict[str, Any] | None = None, max_steps: int | None = None,
-                 success_reward: float | None = None, observer: Observer | None = None) -> None:
+                 success: Success | None = None, observer: Observer | None = None) -> None:
         self._envs = list(envs)
         self._agent = agent
         self._read = read
         self._options = reset_options
         self._max_steps = max_steps
-        self._success_reward = success_reward
+        self._success = success
         self._observer = observer
 
     def run(self, seeds: Iterable[int]) -> Iterator[Episode]:
@@ -156,7 +139,7 @@ class Rollout:
             self._observer(index, row.seed, env, self._agent, None)
         observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
         row.frames.append(self._read(observation))
-        success = succeeded(float(reward), info, self._success_reward)
+        success = success_of(float(reward), info, self._success, bool(terminated))
         out_of_time = truncated or (self._max_steps is not None and row.steps >= self._max_steps)
         if not (success or terminated or out_of_time):
             return None

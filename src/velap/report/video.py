@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from velap.evaluation.rollout import FrameReader
 from velap.methods.velap import VelapAgent
 from velap.report.figures import LatentMap, can_probe, probe, to_pixels
 from velap.runs import storage_errors
@@ -132,7 +131,7 @@ def latent_map_of(player: Player) -> LatentMap | None:
     try:
         if player.model is None or not can_probe(env):
             return None
-        reader = FrameReader(env, player.image_size, player.key.image_key)
+        reader = player.frames_of(env)
         return probe(player.model, env, reader, player.config.model.frame_stack, np.random.default_rng(0))
     finally:
         env.close()

@@ -234,6 +234,7 @@ class Trainer:
             "seed": str(self.seed),
             "dataset_id": self.store.dataset_id,
             "dataset_hash": self.store.content_hash,
+            "reading": self.store.reading.to_json(),
             "train_seconds": f"{self.seconds:.0f}",
             "diagnostics": json.dumps(diagnostics),
             "steps": str(self.step),

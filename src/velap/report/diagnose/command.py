@@ -16,7 +16,6 @@ from velap.config import Config, override
 from velap.data import minari_io
 from velap.errors import ConfigError, DatasetError
 from velap.evaluation.evaluate import Evaluation, Player, load_player
-from velap.evaluation.rollout import FrameReader
 from velap.models.velap import LatentModel, load_checkpoint
 from velap.report.demo import released_checkpoint
 from velap.report.diagnose import figures
@@ -223,7 +222,7 @@ def _look_at_world(console: Console, request: Request, model: LatentModel, playe
     env: gym.Env[Any, Any] = player.make_env()
     seeds, frame_stack = range(request.first_seed, request.first_seed + STARTS), player.config.model.frame_stack
     try:
-        read = FrameReader(env, player.image_size, player.key.image_key)
+        read = player.frames_of(env)
         with console.status("the expert's episodes"):
             curves = expert_curves(model, env, frame_stack, seeds[:SCENES])
         scenes, around = [], None

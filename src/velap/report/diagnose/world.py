@@ -120,7 +120,7 @@ def stack_all(frames: Sequence[NDArray[np.uint8]], frame_stack: int) -> NDArray[
 
 def first_states(player: Player, env: gym.Env[Any, Any], seeds: Sequence[int]) -> Starts:
     """The starts of episodes."""
-    read, stacks = FrameReader(env, player.image_size, player.key.image_key), []
+    read, stacks = player.frames_of(env), []
     for seed in seeds:
         observation, _ = env.reset(seed=seed, options=reset_options(env))
         stacks.append(stack_all([read(observation)], player.config.model.frame_stack)[0])
