@@ -62,6 +62,8 @@ class Server:
         if api_key is None and not _is_local(host):
             raise ConfigError(f"the server would listen on {host} without a key; expected one, for whoever reaches that "
                               "address moves the robot. Set VELAP_API_KEY, or leave --host at 127.0.0.1.")
+        if not 0 <= port <= 65_535:
+            raise ConfigError(f"the port is {port}; expected 0 to 65535, 0 for a free one. Name another with --port.")
         if api_key == "":
             raise ConfigError("the API key is empty; expected some text. Set VELAP_API_KEY to it, or leave it unset.")
         self._policy, self._host, self._port, self._image_key = policy, host, port, image_key
