@@ -237,14 +237,16 @@ class Attacker:
 class GoodClient(threading.Thread):
     """Plays episodes of noise beside a storm and keeps the server's actions; they are those of an agent of this process."""
 
-    def __init__(self, port: int, seed: int, steps_an_episode: int = 40) -> None:
+    def __init__(self, port: int, seed: int, steps_an_episode: int = 40, server: int | None = None) -> None:
         super().__init__(daemon=True)
-        self._port, self._seed, self._length = port, seed, steps_an_episode
+        self._port, self._seed, self._length, self._server = port, seed, steps_an_episode, server
         self._stop_asked = threading.Event()
         self.actions: list[np.ndarray] = []
         """[A] a step."""
         self.milliseconds: list[float] = []
         """Round trips of steps without planning."""
+        self.computing: list[float] = []
+        """What the process `server` computed in each of these [ms]."""
         self.error: Exception | None = None
 
     def run(self) -> None:
@@ -259,14 +261,17 @@ class GoodClient(threading.Thread):
     def _step(self, client: ClientConnection) -> None:
         step = len(self.actions)
         message = pack(observation(noise=step % self._length, reset=step % self._length == 0, seed=self._seed))
+        computed = 0.0 if self._server is None else computing_time(self._server)
         began = time.perf_counter()
         client.send(message)
         answer = client.recv(60)
+        took = (time.perf_counter() - began) * 1e3
         if isinstance(answer, str):
             raise RuntimeError(answer)
         read = unpack(answer)
         if "plan_ms" not in read["server_timing"]:
-            self.milliseconds.append((time.perf_counter() - began) * 1e3)
+            self.milliseconds.append(took)
+            self.computing.append(0.0 if self._server is None else computing_time(self._server) - computed)
         self.actions.append(read["actions"][0])
 
     def stop(self) -> None:
@@ -321,23 +326,27 @@ def endure(checkpoint: Path, messages: int, method: str = "td3bc", oversized_eve
                   storm.memory[-1] - max(storm.memory[: fifth + 1]))
 
 
-def step_times(checkpoint: Path, steps: int, method: str = "velap", core: int | None = None) -> np.ndarray:
-    """Round trips of steps without planning [ms], the server on one core and this process where the system puts it."""
-    with server_process(checkpoint, "--method", method, "--device", "cpu", core=core) as (_, port):
-        good = GoodClient(port, seed=3)
+def step_times(checkpoint: Path, steps: int, method: str = "velap") -> tuple[np.ndarray, np.ndarray]:
+    """Steps without planning, the server on one core: round trips, and the server's own computing of each [ms].
+
+    Other work on the machine lengthens the round trips alone.
+    """
+    core = psutil.Process().cpu_affinity()[0]
+    with server_process(checkpoint, "--method", method, "--device", "cpu", core=core) as (process, port):
+        good = GoodClient(port, seed=3, server=process.pid)
         good.start()
         while len(good.milliseconds) < steps and good.is_alive():
             time.sleep(0.05)
         good.stop()
         if good.error is not None:
             raise good.error
-    return np.array(good.milliseconds)
+    return np.array(good.milliseconds), np.array(good.computing)
 
 
-def calm_p95(times: np.ndarray) -> float:
-    """The 95th percentile of the calmest hundred steps in a row [ms]: other work on the machine delays steps as well."""
-    hundreds = times[: len(times) // 100 * 100].reshape(-1, 100)
-    return float(np.percentile(hundreds, 95, axis=1).min())
+def computing_time(process: int) -> float:
+    """What all threads of a process have computed until now [ms]; Linux."""
+    threads = Path(f"/proc/{process}/task").iterdir()
+    return sum(int((thread / "schedstat").read_text().split()[0]) for thread in threads) / 1e6
 
 
 def study_server(quick: bool = False, json: Path | None = None, checkpoint: Path = SPIRAL) -> None:
@@ -350,18 +359,17 @@ def study_server(quick: bool = False, json: Path | None = None, checkpoint: Path
     """
     console = Console(highlight=False)
     report = endure(checkpoint, 3_000 if quick else 100_000, oversized_every=100 if quick else OVERSIZED_EVERY)
-    core = psutil.Process().cpu_affinity()[0]
-    times = step_times(checkpoint, 200 if quick else 2_000, core=core)
-    p50, p95, p99 = np.percentile(times, [50, 95, 99]).round(2).tolist()
-    calm, load = round(calm_p95(times), 2), round(psutil.getloadavg()[0], 1)
+    trips, computing = step_times(checkpoint, 200 if quick else 2_000)
+    step, own = (np.percentile(times, [50, 95, 99]).round(2).tolist() for times in (trips, computing))
+    load = round(psutil.getloadavg()[0], 1)
     storm, kinds = report.storm, ", ".join(f"{kind} {count}" for kind, count in report.storm.sent.items())
     console.print(
         f"{storm.total} wrong messages in {report.seconds:.0f} s: {storm.refused} refused in words, {storm.answered} still "
         f"an observation, {storm.closed} connections closed, {storm.traceback} tracebacks\nby kind: {kinds}\n"
         f"resident memory from {storm.memory[0]:.0f} to {storm.memory[-1]:.0f} MiB, {report.growth:+.1f} MiB after the "
         f"first fifth\nthe client beside: {report.good_steps} steps, {report.good_wrong} of them with a wrong action\n"
-        f"round trip of a step without a plan on one core: {p50} ms; 95 of 100 within {p95} ms, 99 within {p99} ms; in the "
-        f"calmest hundred 95 within {calm} ms (load average {load})",
+        f"a step without a plan, the server on one core: computing {own[0]} ms, 95 of 100 within {own[1]} ms; round trip "
+        f"{step[0]} ms, 95 of 100 within {step[1]} ms (load average {load})",
         markup=False, soft_wrap=True)
     if json is not None:
         figures = {
@@ -369,8 +377,10 @@ def study_server(quick: bool = False, json: Path | None = None, checkpoint: Path
             "observations": storm.answered, "closed": storm.closed, "seconds": round(report.seconds, 1),
             "memory_mib": [round(value, 1) for value in storm.memory], "growth_mib": round(report.growth, 2),
             "good_steps": report.good_steps, "good_wrong": report.good_wrong,
-            "step_ms": {"p50": p50, "p95": p95, "p99": p99, "p95_of_the_calmest_hundred": calm},
-            "load_average": load, "machine": f"{platform.machine()}, {psutil.cpu_count()} cores", "checkpoint": checkpoint.name,
+            "step_computing_ms_p50_p95_p99": own,
+            "step_round_trip_ms_p50_p95_p99": step,
+            "load_average": load, "machine": f"{platform.machine()}, {psutil.cpu_count()} cores",
+            "checkpoint": checkpoint.name,
         }
         write_atomic(json, (dumps(figures, indent=2) + "\n").encode())
         console.print(f"figures in {json}", markup=False)

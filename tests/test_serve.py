@@ -339,20 +339,21 @@ def test_an_error_of_the_servers_own_is_logged_and_ends_its_connection_alone(
 
 
 def test_wrong_messages_leave_memory_and_good_clients_as_they_are(checkpoint: Path) -> None:
-    report = serving.endure(ROOT / "checkpoints" / "SpiralMaze.safetensors", 3000, oversized_every=100)
+    report = serving.endure(ROOT / "checkpoints" / "SpiralMaze.safetensors", 2000, oversized_every=60)
     storm = report.storm
     assert set(storm.sent) >= {*serving.WRONG, "before the answer", "oversized", "broken frame", "cut off"}
-    assert min(storm.sent.values()) >= 9 and storm.total >= 3000
-    assert storm.refused > 2000 and storm.traceback == 0
+    assert min(storm.sent.values()) >= 9 and storm.total >= 2000
+    assert storm.refused > 1500 and storm.traceback == 0
     assert storm.closed == storm.sent["oversized"] + storm.sent["broken frame"] + storm.sent["cut off"]
     assert report.good_steps > 50 and report.good_wrong == 0
     assert report.growth < 16
 
 
-def test_a_step_without_a_plan_takes_ten_milliseconds_at_most() -> None:
-    core = psutil.Process().cpu_affinity()[0]
-    times = serving.step_times(ROOT / "checkpoints" / "ButtonWall.safetensors", 400, core=core)
-    assert serving.calm_p95(times) <= 10.0
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the time that threads computed from /proc")
+def test_a_step_without_a_plan_takes_ten_milliseconds_of_one_core_at_most() -> None:
+    trips, computing = serving.step_times(ROOT / "checkpoints" / "ButtonWall.safetensors", 200)
+    assert 0.1 < np.percentile(computing, 95) <= 10.0
+    assert np.percentile(trips, 50) >= np.percentile(computing, 5)
 
 
 def test_the_command_serves_until_it_is_told_to_stop(checkpoint: Path) -> None:
