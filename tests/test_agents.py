@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,12 @@ def test_random_actions_fill_the_box() -> None:
     assert np.abs(actions.mean(0)).max() < 0.2
     assert actions.max() > 0.95 * ACTION_SCALE
     assert actions.min() < -0.95 * ACTION_SCALE
+
+
+def test_uniform_actions_without_bounds_are_refused() -> None:
+    space = gym.spaces.Box(np.array([-1.0, -np.inf], np.float32), np.array([1.0, np.inf], np.float32))
+    with pytest.raises(ConfigError, match="uniform actions need bounds"):
+        make_agent("random", None, toy_config(), space)
 
 
 def test_td3bc_follows_the_global_policy_in_env_units() -> None:

@@ -102,7 +102,7 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
                        mapped=mapped)
     directory = out or run_dir(task, preset, seed)
     checkpoint = directory / MODEL
-    if method != "velap" and checkpoint.exists():
+    if not kind.whole_checkpoint and checkpoint.exists():
         _check_origin(checkpoint, task, preset, seed, changes)
     elif not (resume and _is_finished(checkpoint, config, seed, store.content_hash)):
         run(config, store, directory, seed=seed, device=device, resume=resume, base=base, command=command,

@@ -8,8 +8,7 @@ B environments, P rows that ask, K queries a row, M steps remembered, R points, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor
@@ -17,33 +16,29 @@ from torch import Tensor
 from velap.config.planning import ControllerConfig
 from velap.search.types import SearchFns
 
-Step = Callable[[Tensor, Tensor], Tensor]
-"""h: `[*, D], [*, A] → [*, D]`."""
 
-
-class Correction(Protocol):
+class Correction(ABC):
     """Wraps the model by what the rows' episodes have shown. A row's wrapper depends on its own episode alone."""
 
+    @abstractmethod
     def forget(self, rows: Tensor) -> None:
         """Start new episodes in `rows`, bool [B]."""
-        ...
 
+    @abstractmethod
     def observe(self, latents: Tensor) -> None:
         """The latents [B, D] that the last actions led to."""
-        ...
 
-    def acted(self, latents: Tensor, actions: Tensor) -> None:
+    def acted(self, latents: Tensor, actions: Tensor) -> None:  # noqa: B027 - most corrections need not know
         """The actions [B, A] in [-1, 1] that are taken from latents [B, D] now."""
-        ...
 
+    @abstractmethod
     def in_row(self, fns: SearchFns, row: int) -> SearchFns:
         """The model as one row corrects it, for `[R, D]`; `fns` itself where there is nothing to correct."""
-        ...
 
+    @abstractmethod
     def in_rows(self, fns: SearchFns, rows: Tensor) -> SearchFns:
         """The model as each of `rows` int64 [P] corrects it for its own queries, values of `[P, D]` and steps from
         `[P, K, D]`; `fns` itself where there is nothing to correct."""
-        ...
 
 
 def corrections_of(config: ControllerConfig, fns: SearchFns) -> list[Correction]:
@@ -56,7 +51,7 @@ def corrections_of(config: ControllerConfig, fns: SearchFns) -> list[Correction]
     return wanted
 
 
-class Residuals:
+class Residuals(Correction):
     """h corrected by its own errors: a block that pushes against a wall which h does not see comes to expect to stay.
 
     The error of every step that was taken is remembered with its latent and action, and added to predictions from nearby
@@ -135,7 +130,7 @@ class Residuals:
         return fns._replace(step=step, rollout=None)
 
 
-class Revisits:
+class Revisits(Correction):
     """Q^g lowered around the states that the episode has been in: each moves the goal away by some steps.
 
     A state that promises the goal and does not keep it holds the robot until the time is up: plans end there again and
@@ -160,9 +155,6 @@ class Revisits:
         """The latents [B, D] count as visited from now on."""
         for visited, latent in zip(self._visited, latents, strict=True):
             visited.append(latent.clone())
-
-    def acted(self, latents: Tensor, actions: Tensor) -> None:
-        """Where an action was taken does not matter, where the robot stood does."""
 
     def in_row(self, fns: SearchFns, row: int) -> SearchFns:
         """Q^g as one row corrects it: `[*, D] → [*]`."""

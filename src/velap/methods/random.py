@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from velap.errors import ConfigError
 from velap.methods.base import Agent, Method, Parts, masked_seeds
 from velap.methods.states import checked_frames
 from velap.registry import register_method
@@ -24,6 +25,10 @@ class RandomAgent:
     method = "random"
 
     def __init__(self, action_space: Box, frame_stack: int) -> None:
+        if not action_space.is_bounded():
+            raise ConfigError(f"uniform actions need bounds, and the action space is {action_space}; expected finite ones. "
+                              "Give the environment bounds, for example by gymnasium.wrappers.ClipAction or RescaleAction, "
+                              "or use another method.")
         self.frame_stack = frame_stack
         self.last_plan_ms: NDArray[np.float64] = np.empty(0)
         self._low = action_space.low.astype(np.float32)
