@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import importlib.util
 import signal
 import subprocess
@@ -27,9 +28,10 @@ from websockets.sync.client import ClientConnection, connect
 from studies import serving
 from velap import api, cli
 from velap.config import Config, override
+from velap.data.frames import Reading
 from velap.errors import ConfigError, ObservationError
 from velap.evaluation.evaluate import Evaluation, load_player
-from velap.models.velap import LatentModel, Spaces, save_checkpoint
+from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
 from velap.serve.messages import pack, unpack
 from velap.serve.server import Server
 from velap.serve.session import PictureReader, Policy, Session, load_policy
@@ -217,6 +219,32 @@ def test_pictures_are_read(sent: dict[str, Any], key: str | None) -> None:
     np.testing.assert_array_equal(PictureReader(SQUARE, key)(sent), picture(0))
 
 
+@pytest.mark.parametrize(("fit", "wanted"), [
+    ("crop", lambda wide: wide[:, 8:-8]), ("pad", lambda wide: np.pad(wide, ((8, 8), (0, 0), (0, 0)))),
+    ("squash", lambda wide: wide.reshape(16, 16, 2, 3).mean(2)),
+])
+def test_oblong_pictures_become_square_as_those_of_the_training_data(fit: Any, wanted: Callable[[Any], Any]) -> None:
+    wide = np.random.default_rng(0).integers(0, 256, (16, 32, 3), np.uint8)
+    side = 32 if fit == "pad" else 16
+    read = PictureReader(Spaces(side, side, LOW, HIGH), None, Reading(fit=fit))
+    np.testing.assert_allclose(read({"image": wide}), wanted(wide), atol=1)
+
+
+def test_among_several_pictures_the_name_of_the_training_datas_counts() -> None:
+    sent = {"left": picture(1), "front": picture(0)}
+    np.testing.assert_array_equal(PictureReader(SQUARE, None, Reading(image_key="front"))(sent), picture(0))
+    np.testing.assert_array_equal(PictureReader(SQUARE, "left", Reading(image_key="front"))(sent), picture(1))
+
+
+def test_the_checkpoint_says_how_pictures_become_square(checkpoint: Path, tmp_path: Path) -> None:
+    model, config, _ = load_checkpoint(checkpoint)
+    path = tmp_path / "model.safetensors"
+    save_checkpoint(path, model, config, {"seed": "3", "reading": Reading("front", SIDE, "crop").to_json()})
+    wide = np.pad(picture(0), ((0, 0), (8, 8), (0, 0)), constant_values=77)
+    actions = Session(load_policy(path, "td3bc", device="cpu")).step({"front": wide, "left": picture(1)})["actions"]
+    np.testing.assert_allclose(actions, expected_actions(checkpoint, [0], 0, "td3bc"), atol=1e-6)
+
+
 def test_grey_pictures_are_repeated() -> None:
     grey = picture(0)[..., 0]
     for sent in (grey, grey[..., None], grey[None]):
@@ -325,7 +353,7 @@ def test_a_message_in_endless_pieces_ends_its_connection_alone(policy: Policy) -
 
 def test_an_error_of_the_servers_own_is_logged_and_ends_its_connection_alone(
         policy: Policy, caplog: pytest.LogCaptureFixture) -> None:
-    broken = Policy(policy.make_agent, policy.spaces, policy.frame_stack, policy.about)
+    broken = dataclasses.replace(policy)
     agents = [policy.make_agent(), policy.make_agent()]
     agents[0].act = lambda frames: 1 / 0  # type: ignore[method-assign, assignment, return-value]
     object.__setattr__(broken, "make_agent", lambda: agents.pop(0))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap._version import __version__
-from velap.data.frames import stack_indices
+from velap.data.frames import Reading, stack_indices
 from velap.data.images import MIN_SIDE, ImageLayout, to_rgb
 from velap.errors import ObservationError
 from velap.methods.base import Agent, get_method, make_agent
@@ -35,6 +35,8 @@ class Policy:
     spaces: Spaces
     frame_stack: int
     """N [frames]."""
+    reading: Reading
+    """How the pictures of the training data became frames; the robot's become frames in the same way."""
     about: Mapping[str, Any]
     """What a client is told at the start: plain values."""
 
@@ -66,7 +68,8 @@ def load_policy(checkpoint: Path | str, method: str = "velap", device: str = "au
         return make_agent(method, model, config, actions, learnt)
 
     agent()  # a method that does not exist or lacks its head is an error of the start
-    return Policy(agent, spaces, config.model.frame_stack, about)
+    reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else Reading(image_size=spaces.height)
+    return Policy(agent, spaces, config.model.frame_stack, reading, about)
 
 
 class Session:
@@ -74,7 +77,7 @@ class Session:
 
     def __init__(self, policy: Policy, image_key: str | None = None) -> None:
         self._agent = policy.make_agent()
-        self._picture = PictureReader(policy.spaces, image_key)
+        self._picture = PictureReader(policy.spaces, image_key, policy.reading)
         self._frames: deque[NDArray[np.uint8]] = deque(maxlen=policy.frame_stack)
         self._stack = policy.frame_stack
 
@@ -101,13 +104,20 @@ class Session:
 class PictureReader:
     """The camera's picture of an observation, as the model reads it: uint8 [H, W, 3].
 
-    Pictures are uint8, [h, w, 3], [3, h, w] or grey, of the model's size; squares of another size are resized as the
-    training data were. Everything else is an ObservationError.
+    Pictures are uint8, [h, w, 3], [3, h, w] or grey. Those of other sizes than the model's become square and are resized as
+    the training data were. Everything else is an ObservationError.
+
+    Args:
+        spaces: of the model.
+        key: key of the picture, `a/b` when nested; None takes the only picture, or the one that is named as the training
+            data's was.
+        reading: how the training data were read.
     """
 
-    def __init__(self, spaces: Spaces, key: str | None = None) -> None:
+    def __init__(self, spaces: Spaces, key: str | None = None, reading: Reading | None = None) -> None:
         self._size = (spaces.height, spaces.width)
         self._key = key
+        self._reading = reading or Reading(image_size=spaces.height)
 
     def __call__(self, observation: Mapping[str, Any]) -> NDArray[np.uint8]:
         name, raw = self._find(observation)
@@ -122,10 +132,10 @@ class PictureReader:
                                    "stacks frames itself.")
         if layout.sides == self._size:
             return to_rgb(raw[None], layout, None)[0].copy()
-        if layout.sides[0] != layout.sides[1] or height != width:
+        if self._reading.fit is None and layout.sides[0] != layout.sides[1]:
             raise ObservationError(f"{got}, or a square of another size. Crop or pad the picture as it was for the training "
                                    "data.")
-        return to_rgb(raw[None], layout, height)[0].copy()
+        return to_rgb(raw[None], layout, height, self._reading.fit)[0].copy()
 
     def _find(self, observation: Mapping[str, Any]) -> tuple[str, np.ndarray]:
         """Name and array of the picture: the key's, or the only array that may be one."""
@@ -137,6 +147,8 @@ class PictureReader:
             return self._key, arrays[self._key]
         found = {name: array for name, array in arrays.items()
                  if array.ndim == 3 or (array.dtype == np.uint8 and _layout(array) is not None)}
+        if self._reading.image_key in found:
+            return self._reading.image_key, found[self._reading.image_key]
         if len(found) != 1:
             raise ObservationError(f"the observation has {len(found)} pictures; expected one. It has {_listing(arrays)}. "
                                    "Send uint8[H, W, 3]; among several, name the one to use with --image-key.")
