@@ -1,6 +1,6 @@
 """The robot server under fire and under a stopwatch: wrong messages of every kind beside a well-behaved client.
 
-    python -m studies.serving --json results/serving.json
+    velap study server --json results/serving.json
 
 The server runs in a process of its own, so that its memory and its one core are its own.
 """
@@ -24,7 +24,6 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import psutil
-import tyro
 from rich.console import Console
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
@@ -349,15 +348,9 @@ def computing_time(process: int) -> float:
     return sum(int((thread / "schedstat").read_text().split()[0]) for thread in threads) / 1e6
 
 
-def study_server(quick: bool = False, json: Path | None = None, checkpoint: Path = SPIRAL) -> None:
-    """Send wrong messages to a server beside a well-behaved client, and measure steps on one core.
-
-    Args:
-        quick: 3,000 messages instead of 100,000.
-        json: File that the figures are written to.
-        checkpoint: What is served.
-    """
-    console = Console(highlight=False)
+def study_server(console: Console, quick: bool, json: Path | None, checkpoint: Path = SPIRAL) -> None:
+    """100,000 wrong messages (3,000 if `quick`) beside a well-behaved client, and the time of steps on one core; the figures
+    are printed, and written to `json`."""
     report = endure(checkpoint, 3_000 if quick else 100_000, oversized_every=100 if quick else OVERSIZED_EVERY)
     trips, computing = step_times(checkpoint, 200 if quick else 2_000)
     step, own = (np.percentile(times, [50, 95, 99]).round(2).tolist() for times in (trips, computing))
@@ -384,7 +377,3 @@ def study_server(quick: bool = False, json: Path | None = None, checkpoint: Path
         }
         write_atomic(json, (dumps(figures, indent=2) + "\n").encode())
         console.print(f"figures in {json}", markup=False)
-
-
-if __name__ == "__main__":
-    tyro.cli(study_server)

@@ -68,24 +68,28 @@ def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device =
     _study("speed").run_benchmarks(OUT, json, device, only)
 
 
-def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-latents"]],
+def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-latents", "server"]],
                              arg(help="`faults`: kills, damage, full disks. `experts`: can each task be solved, and not by "
-                                      "chance. `exact-latents`: what everything but the encoder can do.")],
+                                      "chance. `exact-latents`: what everything but the encoder can do. "
+                                      "`server`: wrong messages by the thousand.")],
           quick: bool = False, seed: int = 0, write: Path | None = None, json: Path | None = None,
           task: str = "DrawerButton", settings: Settings = ()) -> None:
     """Try what may go wrong, whether the tasks can be solved, or true states instead of latents of frames.
 
     Args:
-        quick: Two kills a command instead of twenty; ten episodes instead of a hundred (fifty on exact latents).
+        quick: Two kills a command instead of twenty; ten episodes instead of a hundred (fifty on exact latents); 3,000
+            messages instead of 100,000.
         seed: Decides the moments of the kills; seed of the experts' first episode; training seed of exact latents.
         task: Manipulation task of exact latents.
         write: Document to write, such as docs/faults.md or docs/experts.md.
-        json: Figures of the experts go to this file as well, such as results/experts.json.
+        json: Figures of the experts or the server go to this file as well, such as results/experts.json.
     """
     if subject == "faults":
         _study("faults.study").study_faults(OUT, quick, seed, write)
     elif subject == "exact-latents":
         _study("exact_latents").study_exact_latents(OUT, task, parse_settings(settings), seed, quick, json)
+    elif subject == "server":
+        _study("serving").study_server(OUT, quick, json)
     else:
         _study("experts").study_experts(OUT, quick, seed, write, json)
 

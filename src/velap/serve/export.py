@@ -156,5 +156,6 @@ def _describe(model: LatentModel, config: Config, metadata: Mapping[str, str],
         "weights_sha256": metadata[WEIGHTS_SHA256], "frame_stack": config.model.frame_stack,
         "image_shape": [spaces.height, spaces.width, 3], "action_low": list(spaces.action_low),
         "action_high": list(spaces.action_high), "command_memory": config.model.command_memory,
+        "reading": json.loads(metadata.get("reading", "null")),
         "programs": {name: asdict(program) for name, program in programs.items()},
     }
