@@ -1,16 +1,36 @@
-"""Where runs lie, and writing a file as a whole or not at all."""
+"""Where runs lie, locks, and writing a file as a whole or not at all."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 OWN_RECORDS, SHIPPED_RECORDS = Path("runs/records"), Path("results/records")
 """Where a user's evaluations write, and where those of the published tables lie. The two never meet."""
 
+
 def run_dir(task: str, preset: str, seed: int) -> Path:
     """Where a training run lives unless said otherwise."""
     return Path("runs") / task.replace("/", "_") / preset / f"seed{seed}"
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock file `path`; the system releases it however a process ends. BlockingIOError: another one holds it."""
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise BlockingIOError(f"{path} is held by another process") from error
+    try:
+        yield
+    finally:
+        lock.release()
+        path.unlink(missing_ok=True)
 
 
 def replace_file(path: Path, content: bytes) -> None:

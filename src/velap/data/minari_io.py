@@ -18,7 +18,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from filelock import FileLock, Timeout
 from minari.dataset.minari_dataset import DATASET_ID_RE, MinariDataset
 from minari.namespace import create_namespace, list_local_namespaces
 from minari.storage.datasets_root_dir import get_dataset_path
@@ -26,7 +25,7 @@ from minari.storage.local import list_local_datasets
 
 from velap.data.mapped import file_sha256
 from velap.errors import DatasetError, StorageError
-from velap.storage import sync
+from velap.storage import locked, sync
 
 UNREADABLE = (
     OSError, KeyError, ValueError, RuntimeError, TypeError, AssertionError, IndexError, AttributeError, EOFError,
@@ -126,16 +125,13 @@ def refuse_existing(dataset_id: str, overwrite: bool) -> None:
 def exclusive(directory: Path, dataset_id: str) -> Iterator[None]:
     """Hold the lock of a work directory; the kernel releases it however the process ends."""
     directory.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(directory / "lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise StorageError(f"another process is writing {dataset_id} (it holds {directory / 'lock'}); expected to be alone. "
-                           "Wait for it or stop it, then run the same command again.") from error
-    try:
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(locked(directory / "lock"))
+        except BlockingIOError as error:
+            raise StorageError(f"another process is writing {dataset_id} (it holds {directory / 'lock'}); expected to be "
+                               "alone. Wait for it or stop it, then run the same command again.") from error
         yield
-    finally:
-        lock.release()
 
 
 def read_metadata(dataset_id: str) -> dict[str, Any]:

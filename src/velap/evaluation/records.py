@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import errno
-import fcntl
 import json
 import os
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from io import FileIO
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any, Self
 
 from velap.errors import RecordError
 from velap.runs import storage_errors
+from velap.storage import locked
 from velap.tasks import TASKS
 
 SCHEMA = 2
@@ -148,25 +149,18 @@ class RecordFile:
     def __init__(self, path: Path, key: RunKey, fresh: bool = False) -> None:
         self.path = path
         self.key = key
-        self._stream = self._open(fresh)
-        try:
-            self.records = self._resume()
-        except BaseException:
-            self._stream.close()
-            raise
-
-    def _open(self, fresh: bool) -> FileIO:
-        with storage_errors(self.path):
+        with storage_errors(self.path), ExitStack() as opened:
             self.path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                opened.enter_context(locked(self.path.with_name(f".{self.path.name}.lock")))
+            except BlockingIOError as error:
+                raise RecordError(f"another evaluation is writing {self.path}. Wait for it, or give other "
+                                  "--records.") from error
             if fresh and self.path.exists():
                 self.path.rename(_free_name(self.path))
-            stream = self.path.open("a+b", buffering=0)
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            stream.close()
-            raise RecordError(f"another evaluation is writing {self.path}. Wait for it, or give other --records.") from error
-        return stream
+            self._stream: FileIO = opened.enter_context(self.path.open("a+b", buffering=0))
+            self.records = self._resume()
+            self._opened = opened.pop_all()
 
     def _resume(self) -> list[Record]:
         """The records already there, all of this run; a torn end is cut off."""
@@ -205,7 +199,7 @@ class RecordFile:
 
     def close(self) -> None:
         """Release the file and its lock."""
-        self._stream.close()
+        self._opened.close()
 
     def __enter__(self) -> Self:
         return self
