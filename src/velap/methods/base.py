@@ -60,13 +60,13 @@ class Parts:
     action_space: Box
     """The environment's."""
     settings: Any
-    """One of the method's `settings`; None where it has none."""
+    """The method's settings; None if it has no settings."""
     head: Any
     """What the method learnt beside the model, of the type `Method.head`; None where it learns nothing."""
 
 
 class Learnt(Protocol):
-    """What a head says of itself; a file's metadata says it as well."""
+    """Identity of a head; the metadata of its file repeat it."""
 
     settings: str
     """Canonical JSON of the learner's config."""
@@ -87,7 +87,8 @@ class Method(ABC):
     label: ClassVar[str]
     """How tables print it."""
     settings: ClassVar[Any] = None
-    """How it acts: a frozen dataclass, whose fields `velap evaluate --set NAME.FIELD=VALUE` replaces; None has no choice."""
+    """How it acts: a frozen dataclass, whose fields `velap evaluate --set NAME.FIELD=VALUE` replaces; None if there is
+    nothing to set."""
     paper_settings: ClassVar[Any] = None
     """The same in the preset `paper`; None takes `settings`."""
     head: ClassVar[type[Head] | None] = None
@@ -99,9 +100,9 @@ class Method(ABC):
     paper_learning: ClassVar[LearnerConfig | None] = None
     """The same in the preset `paper`; None takes `learning`."""
     needs_model: ClassVar[bool] = True
-    """Whether it acts by a trained model at all."""
+    """Whether it needs a trained model."""
     whole_checkpoint: ClassVar[bool] = False
-    """Whether it acts by all of the checkpoint's weights and config, or by those alone that all methods share."""
+    """Whether it acts by the whole checkpoint, or only by the weights and config that all methods share."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -116,7 +117,7 @@ class Method(ABC):
         return self.head is not None
 
     def settings_of(self, preset: str, changes: Mapping[str, Any] | None = None) -> Any:
-        """How it plans in a preset with the fields of `changes` replaced; None where it has no settings."""
+        """How it plans in a preset with the fields of `changes` replaced; None if it has no settings."""
         settings = self.paper_settings if preset == "paper" and self.paper_settings is not None else self.settings
         return _changed(f"the method {self.name!r}", settings, changes)
 
@@ -129,13 +130,13 @@ class Method(ABC):
         return changed
 
     def nothing_to_learn(self) -> UnknownTaskError:
-        """The error of who asks for a learner or a head where there is none."""
+        """The error for asking for the learner or the head of a method that learns nothing."""
         return UnknownTaskError(f"the method {self.name!r} has no learner of its own; expected one of "
                                 f"{', '.join(learning_methods())}. The others act by the joint checkpoint alone: `velap "
                                 "train TASK`.")
 
     def config_hash(self, config: Config, head: Learnt | None = None, settings: Any = None) -> str:
-        """The `config_hash` of its records: all that decides how it acts. `settings` None takes the preset's."""
+        """The `config_hash` of its records, of everything that decides how it acts. `settings` None takes the preset's."""
         settings = settings or self.settings_of(config.preset)
         parts: dict[str, Any] = {"method": self.name, "settings": asdict(settings) if settings is not None else {},
                                  "config": config.to_json() if self.whole_checkpoint else config.shared_json()}
@@ -148,7 +149,7 @@ class Method(ABC):
 
 
 def _changed(owner: str, defaults: Any, changes: Mapping[str, Any] | None) -> Any:
-    """A dataclass, or None, with the fields of `changes` replaced; raises ConfigError for a field that it has not."""
+    """A dataclass, or None, with the fields of `changes` replaced; raises ConfigError for unknown fields."""
     names = [field.name for field in fields(defaults)] if defaults is not None else []
     unknown = sorted(set(changes or {}) - set(names))
     if unknown:

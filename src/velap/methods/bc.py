@@ -24,16 +24,15 @@ class BCConfig(LearnerConfig):
     """D.1."""
 
     passes: int = 100
-    """The training ends after this many passes over its transitions, where that is sooner than `steps` and no fewer than
-    `LEAST_STEPS`; 0 is no such end. ours: on the hundred transitions of few successes it overfits from there on; 0 in
-    `paper`."""
+    """Most passes over the transitions; they end the training before `steps`, but not before `LEAST_STEPS`. 0 disables it.
+    ours: beyond that BC(D*) overfits on a hundred transitions. 0 in `paper`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require("passes", self.passes >= 0, "0 or more passes")
 
     def length(self, transitions: int) -> int:
-        """Updates of a training on so many transitions, ended early by `passes` [steps]."""
+        """Updates of a training on this number of transitions, limited by `passes` [steps]."""
         enough = max(LEAST_STEPS, -(-self.passes * transitions // self.batch))
         return min(self.steps, enough) if self.passes else self.steps
 
@@ -41,7 +40,7 @@ class BCConfig(LearnerConfig):
 PAPER_BC = BCConfig(steps=300_000, batch=128, learning_rate=3e-4, cosine=False, passes=0)
 """D.1."""
 LEAST_STEPS = 50
-"""Updates that `passes` leaves at least. ours."""
+"""Fewest updates that `passes` leaves. ours."""
 
 
 class BCLearner(FrozenLearner[BCConfig, PolicyHead]):

@@ -1,7 +1,7 @@
-"""What an episode so far corrects in the model that its plans and its controller act by (ours).
+"""What the episode so far corrects in the model that its plans and its controller use (ours).
 
-A correction wraps the callables of the search: `in_row` for everything that one row asks, as its plan does, `in_rows` for a
-query or several of each of some rows.
+A correction wraps the callables of the search: `in_row` for all queries of one row, such as those of its plan; `in_rows` for
+one or several queries of each of some rows.
 
 B environments, P rows that ask, K queries a row, M steps remembered, R points, D latent dimensions, A action dimensions.
 """
@@ -52,7 +52,8 @@ def corrections_of(config: ControllerConfig, fns: SearchFns) -> list[Correction]
 
 
 class Residuals(Correction):
-    """h corrected by its own errors: a block that pushes against a wall which h does not see comes to expect to stay.
+    """h corrected by its own errors: after a few pushes against a wall that h does not know, the model predicts that the
+    block stays.
 
     The error of every step that was taken is remembered with its latent and action, and added to predictions from nearby
     latents by similar actions, weighted by a Gaussian kernel.
@@ -63,7 +64,7 @@ class Residuals(Correction):
     ACTION_WIDTH = 0.5
     """Width of the kernel over actions in [-1, 1]."""
     LEAST_ERROR = 0.4
-    """Smaller errors are left alone [one-step lengths]."""
+    """Smaller errors are not corrected [one-step lengths]."""
 
     def __init__(self, size: int, fns: SearchFns) -> None:
         self.size = size
@@ -85,7 +86,7 @@ class Residuals(Correction):
         self._known[rows], self._taken[rows] = 0, 0
 
     def observe(self, latents: Tensor) -> None:
-        """The latents [B, D] that the last actions led to: what h was wrong by is remembered."""
+        """The latents [B, D] that the last actions led to; h's errors are remembered."""
         if self._latents.shape[:2] != self._known.shape:
             return
         row, slot = torch.arange(len(latents), device=latents.device), (self._taken - 1) % self.size
@@ -133,9 +134,9 @@ class Residuals(Correction):
 class Revisits(Correction):
     """Q^g lowered around the states that the episode has been in: each moves the goal away by some steps.
 
-    A state that promises the goal and does not keep it holds the robot until the time is up: plans end there again and
-    again, and π^g takes over there for nothing. As in learning real-time A* (Korf, 1990) the promise is corrected while the
-    robot stays, and another way becomes the better one. One that gets on leaves its past behind and pays little.
+    A state whose Q^g is too high holds the robot until time is up: plans keep ending there, and π^g takes over in vain. As
+    in learning real-time A* (Korf, 1990), the estimate is corrected while the robot stays, until another way is better. A
+    robot that moves on leaves its visits behind and pays little.
     """
 
     def __init__(self, penalty: float, fns: SearchFns) -> None:

@@ -1,7 +1,7 @@
-"""What leads besides Algorithm 2 (ours).
+"""What leads in place of Algorithm 2 (ours).
 
-A leader takes a row over while it holds; of several the first one does. Policies in place of π^g lead where Algorithm 2 asks
-for π^g: near the goal, and where a plan leads nowhere.
+A leader takes over a row while its condition holds; of several leaders the first one acts. Policies in place of π^g lead
+where Algorithm 2 asks for π^g: near the goal, and where a plan leads nowhere.
 
 B environments, S actions to choose from, D latent, A action dimension.
 """
@@ -23,7 +23,7 @@ from velap.search.types import SearchFns
 
 
 class Lead(NamedTuple):
-    """What a leader says of every row."""
+    """A leader's answer for every row."""
 
     leads: Tensor
     """[B] bool."""
@@ -66,13 +66,13 @@ def leaders_of(config: Config, fns: SearchFns) -> list[Leader]:
 
 
 def global_policy_of(config: Config, model: LatentModel, fns: SearchFns) -> GlobalPolicy:
-    """π^g, or what a config has act in its place."""
+    """π^g, or the policy that the config puts in its place."""
     policy: GlobalPolicy = Held(model, config.controller.held_turn) if model.held_policy is not None else Plain(model)
     return Strongest(policy, fns, config.controller.goal_lookahead) if config.controller.goal_lookahead > 0 else policy
 
 
 class CloneNearGoal:
-    """The policy cloned from successes at the end of the way, as long as revisits do not say otherwise."""
+    """The policy cloned from successes acts near the goal, unless revisits have lowered Q^g there."""
 
     def __init__(self, fns: SearchFns, close: float) -> None:
         """`close` [Q-value]: it leads where Q^g is above that."""
@@ -80,16 +80,17 @@ class CloneNearGoal:
         self._policy, self._value, self._close = fns.act_success, fns.value, close
 
     def lead(self, latents: Tensor, near_goal: Tensor) -> Lead:
-        """Where Q^g, as it was learnt and as it is corrected, says that the goal is close."""
+        """Rows where both the learnt and the corrected Q^g put the goal close."""
         return Lead(near_goal & (self._value(latents) > self._close), self._policy(latents))
 
 
 class CloneByRollout:
-    """The policy cloned from successes wherever, by the model, it gets to the goal: simulated by h, slow as the data and
-    with stronger actions, until Q^g says that the goal is there.
+    """The policy cloned from successes acts wherever it reaches the goal in the model: h simulates it with its own and with
+    stronger actions, and Q^g says whether the goal is reached.
 
-    A search finds where h errs to advantage, and leads through what h does not know to be solid. A policy that was learnt
-    without h does not seek those errors, so that a simulated arrival can be believed where a planned one cannot.
+    A search finds the places where h errs in its favour, and plans through objects that h does not know to be solid. A
+    policy that was learnt without h does not seek those errors, so its simulated arrival is more credible than a planned
+    one.
     """
 
     def __init__(self, fns: SearchFns, horizon: int, goal_value: float, gains: Sequence[float]) -> None:
@@ -100,7 +101,7 @@ class CloneByRollout:
         self._horizon, self._goal_value, self._gains = horizon, goal_value, gains
 
     def lead(self, latents: Tensor, near_goal: Tensor) -> Lead:
-        """Where a simulation gets to the goal: the first action of the variant that is there first."""
+        """Rows where a simulation reaches the goal, and the first action of the variant that reaches it first."""
         found = arrivals(self._policy, self._step, self._value, latents, self._goal_value, self._horizon, self._gains)
         soonest, variant = found.steps.min(0)
         return Lead(~soonest.isinf(), found.first[variant, torch.arange(len(latents), device=latents.device)])
@@ -139,7 +140,7 @@ class Held:
         self._steps[rows] = 0
 
     def __call__(self, latents: Tensor) -> Tensor:
-        """Whose turn it is in each row."""
+        """The action of the policy whose turn it is in each row."""
         held = self._held(latents)
         if self._turn == 0:
             return held

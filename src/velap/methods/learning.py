@@ -1,7 +1,7 @@
 """Training of the heads on frozen latents: one command a method, beside a joint checkpoint.
 
 `<method>.safetensors` is the head, `<method>.metrics.jsonl` its losses, `<method>.state.safetensors` what an interrupted run
-goes on from. Heads are derived from the joint checkpoint: one that no longer belongs to it is learnt anew.
+goes on from. Heads depend on the joint checkpoint: a head of another checkpoint is learnt anew.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class HeadResult:
     steps: int
     """Updates."""
     seconds: float
-    """Training time, all sittings [s]."""
+    """Training time, summed over interruptions [s]."""
     diagnostics: dict[str, float]
     """Held-out losses at the end."""
 
@@ -162,7 +162,7 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
 
 
 def read_result(path: Path) -> HeadResult:
-    """The outcome that a head's file tells of."""
+    """The result of the training of a head's file."""
     return _result(path, load_tensors(path)[1])
 
 

@@ -1,4 +1,4 @@
-"""Uniform actions: what a task gives to who knows nothing. ours: Table 1 has no such row.
+"""Uniform actions: how far a task gets without any knowledge. ours: Table 1 has no such row.
 
 B environments, N stacked frames, A action dimension.
 """
@@ -60,5 +60,5 @@ class Random(Method):
     needs_model = False
 
     def agent(self, parts: Parts) -> Agent:
-        """Acts without a model; the frames are stacked as for one, and not looked at."""
+        """Acts without a model; frames are stacked but not read."""
         return RandomAgent(parts.action_space, parts.config.model.frame_stack)

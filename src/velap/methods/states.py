@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 def checked_frames(frames: Any, stack: int, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
     """The frames of B states as φ reads them: uint8 [B, N, H, W, 3] in one block of memory.
 
-    Raises ObservationError for every other type, number of axes and shape. φ would take some of them silently, floats in
-    [0, 1] for instance, and lead to another action.
+    Raises ObservationError for every other type, number of axes and shape. φ would accept some of them silently, for
+    instance floats in [0, 1], and give another action.
 
     Args:
         frames: what `act` was given; a view of any strides is copied.

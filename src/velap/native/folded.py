@@ -20,7 +20,7 @@ from velap.models.networks import LEAK, MLP, EnsembleMLP
 
 Forward = Callable[..., Tensor]
 SMALLEST_GAIN = 1e-6
-"""Gains are divided by; nearer to 0 than this they count as this."""
+"""Least size of a gain; gains are divided by."""
 
 
 class Dense(NamedTuple):
@@ -31,7 +31,7 @@ class Dense(NamedTuple):
     bias: Tensor
     """[V], or [n, 1, V]."""
     norm: nn.LayerNorm | nn.BatchNorm1d | tuple[Tensor, Tensor] | None
-    """What follows; (gain, shift), each like the bias, is a layer normalisation."""
+    """What follows: a layer normalisation (gain, shift), each shaped like the bias."""
 
 
 class Folded(NamedTuple):

@@ -149,7 +149,7 @@ def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor]) -
 def native_rollout(
     acting: Sequence[Folded], moving: Sequence[Folded], residual: bool
 ) -> Callable[[Tensor, Tensor, int], Tensor] | None:
-    """`z [R, D], noise [R, S, m], steps → z [R, D]` after so many steps with the actions tanh(acting(z, noise)).
+    """`z [R, D], noise [R, S, m], steps → z [R, D]` after that number of steps with the actions tanh(acting(z, noise)).
 
     The noise of step i is number min(i, S - 1); `acting` without noise takes m = 0. `moving(z, action)` is the next latent,
     or with `residual` the change. None where kernels.c cannot take the layers. The weights are copied.
