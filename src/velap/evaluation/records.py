@@ -60,7 +60,7 @@ class RunKey:
     max_steps: int | None = None
     """Time limit [steps]; None only in records of schema 1 that do not tell it."""
     success_rule: str | None = None
-    """What counts as success, a rule of `velap.data.success`; None: what the environment's info says, else a positive reward."""
+    """What counts as success, a rule of `velap.data.success`; None: the info's word, else a positive reward."""
 
     def path(self, root: Path) -> Path:
         """Its record file below `root`."""
