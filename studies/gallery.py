@@ -1,8 +1,11 @@
-"""`velap figure tasks`: what an agent sees of every task, where a test episode starts and where it has to get."""
+"""`velap figure tasks`: what an agent sees of every task, where a test episode starts and where it has to get.
+
+`velap figure tasks-widowx`: an expert's episode of each task of the WidowX arm, as an agent sees it. F frames.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +18,9 @@ from rich.console import Console
 
 import velap.envs  # noqa: F401 - registers the tasks
 from velap.errors import VelapError
-from velap.evaluation.rollout import play_without_frames
+from velap.evaluation.experts import episode
 from velap.runs import storage_errors
-from velap.tasks import TASKS, Task
+from velap.tasks import ROBOT_TASKS, TASKS, Task
 
 SCALE = 4
 """Enlargement of the frames; a pixel stays a square."""
@@ -25,6 +28,10 @@ GAP = 10
 """White between the frames, and below the text under one [px]."""
 CAPTION = 26
 """Height of a line of text [px]."""
+
+
+FILM = 6
+"""Frames of an episode that are shown, evenly spaced from start to success."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ def shoot(task: Task, seed: int = 0) -> Shots:
     world: Any = gym.make(task.env_id).unwrapped
     world.start({"split": "test"}, seed)
     start = world.render()
-    steps = play_without_frames(world, world.expert_action, seed, task.max_steps)
+    steps = episode(world, world.expert_action, seed, task.max_steps)
     if steps is None:
         raise VelapError(f"the expert of {task.name} does not solve test seed {seed}; expected success within "
                          f"{task.max_steps} steps. `velap study experts` tells how many seeds it solves; take another one.")
@@ -76,4 +83,42 @@ def show_tasks(console: Console, path: Path, seed: int = 0) -> None:
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         side_by_side(shots).save(path)
+    console.print(f"picture {path}", markup=False)
+
+
+def film(task: Task, seed: int = 0) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Frames [F, H, W, 3] of the expert's episode from the test start of that seed, and their times [F] [steps]."""
+    steps = shoot(task, seed).steps
+    times = np.linspace(0, steps, FILM).round().astype(np.int64)
+    world: Any = gym.make(task.env_id).unwrapped
+    frames = [world.reset(seed=seed)[0]]
+    frames += [world.step(world.expert_action())[0] for _ in range(steps)]
+    return np.stack(frames)[times], times
+
+
+def strips(films: Mapping[str, tuple[NDArray[np.uint8], NDArray[np.int64]]]) -> Image.Image:
+    """A row a task: its frames in order, their times under them."""
+    side = SCALE * next(iter(films.values()))[0].shape[1]
+    row = side + CAPTION + GAP
+    sheet = Image.new("RGB", (FILM * (side + GAP) + GAP, GAP + len(films) * row), "white")
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=17)
+    for number, (name, (frames, times)) in enumerate(films.items()):
+        top = GAP + number * row
+        for column, (frame, time) in enumerate(zip(frames, times, strict=True)):
+            left = GAP + column * (side + GAP)
+            sheet.paste(Image.fromarray(frame).resize((side, side), Image.Resampling.NEAREST), (left, top))
+            text = f"{name}, test start" if column == 0 else f"step {time}" + (", success" if column == FILM - 1 else "")
+            pen.text((left + side / 2, top + side + CAPTION / 2), text, fill="black", font=font, anchor="mm")
+    return sheet
+
+
+def show_episodes(console: Console, path: Path, seed: int = 0) -> None:
+    """Draw an expert's episode of each robot task into a PNG."""
+    films = {}
+    for task in ROBOT_TASKS:
+        with console.status(f"drawing {task.name}"):
+            films[task.name] = film(task, seed)
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        strips(films).save(path)
     console.print(f"picture {path}", markup=False)

@@ -29,6 +29,21 @@ def test_the_picture_shows_start_and_goal_of_every_task(tmp_path: Path, monkeypa
         assert caption.min() < 100  # there is text
 
 
+def test_films_lead_from_test_start_to_success(tmp_path: Path):
+    gallery.show_episodes(Console(), tmp_path / "docs" / "tasks_widowx.png", seed=3)
+    sheet = np.asarray(Image.open(tmp_path / "docs" / "tasks_widowx.png"))
+    for row, name in enumerate(("Sponge", "Rope")):
+        shots = gallery.shoot(get_task(name), 3)
+        frames, times = gallery.film(get_task(name), 3)
+        assert times[-1] == shots.steps
+        np.testing.assert_array_equal(frames[0], shots.start)
+        np.testing.assert_array_equal(frames[-1], shots.goal)
+        top = gallery.GAP + row * (256 + gallery.CAPTION + gallery.GAP)
+        for column, frame in enumerate(frames):
+            left = gallery.GAP + column * (256 + gallery.GAP)
+            np.testing.assert_array_equal(sheet[top : top + 256 : 4, left : left + 256 : 4], frame)
+
+
 def test_the_goal_state_is_a_success(monkeypatch: pytest.MonkeyPatch):
     shots = gallery.shoot(get_task("ObstacleMaze"), 0)
     env = ObstacleMaze()

@@ -1,7 +1,7 @@
 """Tasks: environment, dataset recipe (Table 10), time limit and config of each (Tables 7-9).
 
-The six of the paper are here. Add your own by `velap.register_task("Mine")(Task(...))`, or by an entry point of the group
-`velap.tasks`.
+The six of App. C and the two of App. E.1 are here. Add your own by `velap.register_task("Mine")(Task(...))`, or by an entry
+point of the group `velap.tasks`.
 """
 
 from __future__ import annotations
@@ -37,12 +37,13 @@ class Recipe:
     """Trajectories a context."""
     max_steps: int
     """Longest trajectory [steps]."""
-    success_percent: float
-    """Share of transitions with reward 1, as the paper reports it [%]."""
+    success_percent: float | None = None
+    """Share of transitions with reward 1, as Table 10 reports it [%]; None where it does not."""
     action_noise: float = 0.3
     """Standard deviation of the Gaussian steps of the random-walk actions (C.1.1). ours: the paper gives no number."""
     expert_radius: float = 0.0
-    """Distance to the goal within which a noisy expert acts as the expert (C.2) [m]. ours: the paper says "close"."""
+    """Distance to the goal within which a noisy expert acts as the expert (C.2), or an operator's successes start (E.1) [m].
+    ours: the paper says "close" and "within the vicinity"."""
     expert_noise: float = 0.3
     """Standard deviation of the Gaussian noise on a noisy expert's actions. ours: the paper gives no number."""
 
@@ -54,7 +55,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Task:
-    """One task of App. C."""
+    """One task."""
 
     name: str
     env_id: str
@@ -318,8 +319,27 @@ PAPER_TASKS = (
     ),
 )
 """The six tasks of App. C."""
+ROBOT_TASKS = (
+    Task(
+        name="Sponge",
+        env_id="velap/Sponge-v0",
+        entry_point="velap.envs.widowx.sponge:Sponge",
+        max_steps=150,
+        recipe=Recipe(contexts=200, trajectories=1, max_steps=80, expert_radius=0.14),
+        behaviours={"gamepad-play": 0.4, "gamepad-purpose": 0.6},
+    ),
+    Task(
+        name="Rope",
+        env_id="velap/Rope-v0",
+        entry_point="velap.envs.widowx.rope:Rope",
+        max_steps=200,
+        recipe=Recipe(contexts=150, trajectories=1, max_steps=140, expert_radius=0.12),
+        behaviours={"gamepad-play": 0.4, "gamepad-purpose": 0.6},
+    ),
+)
+"""The two tasks of the real robot (App. E.1), in simulation: 200 and 150 episodes of about 15,000 steps together."""
 TASKS: Registry[Task] = registry.TASKS
-for _task in PAPER_TASKS:
+for _task in (*PAPER_TASKS, *ROBOT_TASKS):
     TASKS.add(_task.name, _task)
 
 

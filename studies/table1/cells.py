@@ -24,7 +24,7 @@ from velap.models.velap import WEIGHTS_SHA256, shared_weights
 from velap.registry import METHODS
 from velap.runs import write_atomic
 from velap.storage import run_dir
-from velap.tasks import PRESETS, TASKS, Recipe, get_task, make_config
+from velap.tasks import PRESETS, ROBOT_TASKS, TASKS, Recipe, get_task, make_config
 from velap.training.loop import MODEL
 
 DATASET_SEED = 0
@@ -42,7 +42,8 @@ def in_paper_order(names: Sequence[str], order: Sequence[str]) -> tuple[str, ...
     return tuple(sorted(names, key=lambda name: order.index(name) if name in order else len(order)))
 
 
-TASK_ORDER = in_paper_order(tuple(TASKS), PAPER_TASKS)
+TASK_ORDER = in_paper_order([name for name in TASKS if name not in {task.name for task in ROBOT_TASKS}], PAPER_TASKS)
+"""Tasks of the table; those of the robot belong to Table 11."""
 METHOD_ORDER = in_paper_order(tuple(METHODS), ROWS)
 
 
@@ -161,7 +162,7 @@ def record_problem(cell: Cell, records: Sequence[Record]) -> str:
                 f"{TRAINING}")
     expected: dict[str, Any] = {
         "task": cell.task, "method": cell.method, "preset": cell.preset, "train_seed": cell.seed, "env": task.env_id,
-        "env_kwargs": {}, "image_key": None, "max_steps": task.max_steps, "config_hash": config_hash}
+        "env_kwargs": {}, "image_key": None, "max_steps": task.max_steps, "success_reward": None, "config_hash": config_hash}
     if joint is not None:
         expected["checkpoint"] = joint[WEIGHTS_SHA256] if method.whole_checkpoint else shared_weights(joint)
     for name, value in expected.items():

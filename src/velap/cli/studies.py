@@ -65,7 +65,7 @@ def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device =
         json: Write them to this file as well, such as results/bench/cpu.json.
         only: Names of the benchmarks to measure, such as plan_latency_1; all unless said.
     """
-    _study("speed.command").run_benchmarks(OUT, json, device, only)
+    _study("speed").run_benchmarks(OUT, json, device, only)
 
 
 def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-latents", "server"]],
@@ -94,12 +94,12 @@ def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-late
         _study("experts").study_experts(OUT, quick, seed, write, json)
 
 
-def figure(name: Annotated[Positional[Literal["tasks", "sawyer-drawing"]], arg(help="What to draw.")],
+def figure(name: Annotated[Positional[Literal["tasks", "tasks-widowx", "sawyer-drawing"]], arg(help="What to draw.")],
            write: Path | None = None) -> None:
     """Draw a picture of the documentation anew.
 
-    `tasks`: test start and goal state of every task, as an agent sees them. `sawyer-drawing`: our drawing of the arm beside
-    Meta-World's geometry.
+    `tasks`: test start and goal state of every task, as an agent sees them. `tasks-widowx`: an expert's episode of each task
+    of the WidowX arm. `sawyer-drawing`: our drawing of the Sawyer arm beside Meta-World's geometry.
 
     Args:
         write: Where it goes; docs/NAME.png (with _ for -) unless said.
@@ -107,6 +107,8 @@ def figure(name: Annotated[Positional[Literal["tasks", "sawyer-drawing"]], arg(h
     path = write or Path("docs") / f"{name.replace('-', '_')}.png"
     if name == "tasks":
         _study("gallery").show_tasks(OUT, path)
+    elif name == "tasks-widowx":
+        _study("gallery").show_episodes(OUT, path)
     else:
         _study("drawing").show_drawing(OUT, path)
 

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from velap.data.gamepad import gamepad_play, gamepad_purpose
 from velap.envs.protocol import HasTestRegion, Positioned, ScriptedTask
 from velap.tasks import Recipe
 
@@ -59,7 +60,12 @@ def noisy_expert(env: gym.Env, recipe: Recipe, rng: np.random.Generator) -> Poli
     return act
 
 
-BEHAVIOURS: dict[str, Behaviour] = {"random-walk": random_walk, "noisy-expert": noisy_expert}
+BEHAVIOURS: dict[str, Behaviour] = {
+    "random-walk": random_walk,
+    "noisy-expert": noisy_expert,
+    "gamepad-play": gamepad_play,
+    "gamepad-purpose": gamepad_purpose,
+}
 """Behaviours by name."""
 
 

@@ -54,7 +54,8 @@ def dataset_card(store: FrameStore, task: Task | None = None, positions: np.ndar
     """
     successes, transitions = int(store.rewards.sum()), store.n_transitions
     share = 100.0 * successes / transitions
-    paper = f", the paper's is {task.recipe.success_percent:.2f} % (Table 10)" if task else ""
+    percent = task.recipe.success_percent if task else None
+    paper = "" if percent is None else f", the paper's is {percent:.2f} % (Table 10)"
     failures = int((store.terminated & (store.rewards == 0)).sum())
     taken = np.ones(len(store.actions), bool)
     taken[store.episode_start + store.episode_length] = False
@@ -81,21 +82,23 @@ def dataset_card(store: FrameStore, task: Task | None = None, positions: np.ndar
     if provenance and provenance.get("command"):
         lines.append(f"- made by: `{provenance['command']}`")
     if task is not None:
-        lines += _against_table_10(store, task, share, (provenance or {}).get("contexts"))
+        lines += _against_recipe(store, task, share, (provenance or {}).get("contexts"))
     lines += ["", "Episode length [steps]:", "", *_length_histogram(store.episode_length), "", "Episode return:", "",
               *_histogram(episode_returns(store), [-0.5, 0.5, 1.5], ["0", "1"]), ""]
     return "\n".join(lines)
 
 
-def _against_table_10(store: FrameStore, task: Task, share: float, trajectories: Sequence[int] | None) -> list[str]:
-    """A table of what is here and in the paper; share of successful transitions [%], `trajectories` of each context."""
+def _against_recipe(store: FrameStore, task: Task, share: float, trajectories: Sequence[int] | None) -> list[str]:
+    """A table of what is here and in Table 10 or, where that lacks the task, in its recipe; share of successful transitions
+    [%], `trajectories` of each context."""
     each = "-" if not trajectories else "–".join(str(count) for count in sorted({min(trajectories), max(trajectories)}))
     recipe = task.recipe
-    return ["", "| | here | Table 10 |", "| --- | --- | --- |",
+    source, percent = ("recipe", "-") if recipe.success_percent is None else ("Table 10", f"{recipe.success_percent:.2f}")
+    return ["", f"| | here | {source} |", "| --- | --- | --- |",
             f"| contexts | {len(trajectories) if trajectories else '-'} | {recipe.contexts} |",
             f"| trajectories a context | {each} | {recipe.trajectories} |",
             f"| longest trajectory [steps] | {store.episode_length.max()} | {recipe.max_steps} |",
-            f"| successful transitions [%] | {share:.2f} | {recipe.success_percent:.2f} |"]
+            f"| successful transitions [%] | {share:.2f} | {percent} |"]
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -160,6 +160,7 @@ def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, 
     """Write the dataset and its card from the shards; gives the store, the dataset's directory and the card."""
     store, arrays = _assemble(work / "shards", _shards(task), description, dataset_id)
     recipe, names = task.recipe, sorted(plan["shares"])
+    source = "App. E.1" if recipe.success_percent is None else "Table 10"
     positions = arrays["positions"] if arrays["positions"].shape[1] else None
     provenance = {**provenance, **_composition(store, arrays, names)}
     extras = Extras(
@@ -170,7 +171,7 @@ def _build(task: Task, plan: dict[str, Any], work: Path, description: dict[str, 
         env_spec=EnvSpec.from_json(description["env_spec"]) if description["env_spec"] else None,
         metadata={"algorithm_name": ", ".join(names), "author": {"velap"},
                   "description": f"{task.name}: {recipe.contexts} × {recipe.trajectories} trajectories of at most "
-                                 f"{recipe.max_steps} steps, seed {plan['seed']} (Table 10 of VELAP, CoRL 2023)."},
+                                 f"{recipe.max_steps} steps, seed {plan['seed']} ({source} of VELAP, CoRL 2023)."},
         provenance=provenance,
     )
     path = write_dataset(store, extras, overwrite=True,

@@ -28,23 +28,26 @@ Frame = NDArray[np.uint8]
 
 
 class Renderer:
-    """Draws square frames of a fixed camera. Shadows, reflections, fog, sky and multisampling are off: they cost most."""
+    """Draws square frames of a fixed camera. What costs most is off: reflections, fog, sky, multisampling, and unless asked
+    for shadows."""
 
-    def __init__(self, model: Any, size: int) -> None:
-        """`model` is any MjModel with the same meshes and textures as those drawn later; `size` [px]."""
+    def __init__(self, model: Any, size: int, shadow_map: int = 0) -> None:
+        """`model` is any MjModel with the same meshes and textures as those drawn later; `size` [px]. `shadow_map` is the
+        side of the map of shadows [px]; 0 draws none."""
         self.size = size
         # the only fields of the model that a context reads besides its assets; put back, since models are shared
         quality, visual = model.vis.quality, model.vis.global_
         before = quality.offsamples, quality.shadowsize, visual.offwidth, visual.offheight
-        quality.offsamples, quality.shadowsize, visual.offwidth, visual.offheight = 0, 0, size, size
+        quality.offsamples, quality.shadowsize, visual.offwidth, visual.offheight = 0, shadow_map, size, size
         try:
             self._gl, self._context, self.backend = make_context(model, size)
         finally:
             quality.offsamples, quality.shadowsize, visual.offwidth, visual.offheight = before
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=max(64, 2 * model.ngeom))
-        for flag in ("SHADOW", "REFLECTION", "SKYBOX", "FOG", "HAZE"):
+        for flag in ("REFLECTION", "SKYBOX", "FOG", "HAZE"):
             self._scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}").value] = 0
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = shadow_map > 0
         self._option = mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
@@ -72,14 +75,14 @@ class Renderer:
 _renderers: dict[tuple[Any, ...], Renderer] = {}
 
 
-def shared_renderer(assets: str, model: Any, size: int) -> Renderer:
+def shared_renderer(assets: str, model: Any, size: int, shadow_map: int = 0) -> Renderer:
     """The renderer of this process and thread for frames of `size` [px] of models with the same `assets`, a name.
 
     A context costs a hundred frames to make, so that environments of one kind share one; a forked child makes its own.
     """
-    key = (os.getpid(), threading.get_ident(), assets, size)
+    key = (os.getpid(), threading.get_ident(), assets, size, shadow_map)
     if key not in _renderers:
-        _renderers[key] = Renderer(model, size)
+        _renderers[key] = Renderer(model, size, shadow_map)
         atexit.register(_close, key)  # registered after MuJoCo's own clean-up, hence run before it
     return _renderers[key]
 

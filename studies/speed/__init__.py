@@ -1,1 +1,0 @@
-"""Speed ratios, measured side by side."""
