@@ -18,7 +18,7 @@ from rich.console import Console
 
 import velap.envs  # noqa: F401 - registers the tasks
 from velap.errors import VelapError
-from velap.evaluation.experts import episode
+from velap.evaluation.rollout import play_without_frames
 from velap.runs import storage_errors
 from velap.tasks import ROBOT_TASKS, TASKS, Task
 
@@ -50,7 +50,7 @@ def shoot(task: Task, seed: int = 0) -> Shots:
     world: Any = gym.make(task.env_id).unwrapped
     world.start({"split": "test"}, seed)
     start = world.render()
-    steps = episode(world, world.expert_action, seed, task.max_steps)
+    steps = play_without_frames(world, world.expert_action, seed, task.max_steps)
     if steps is None:
         raise VelapError(f"the expert of {task.name} does not solve test seed {seed}; expected success within "
                          f"{task.max_steps} steps. `velap study experts` tells how many seeds it solves; take another one.")

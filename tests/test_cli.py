@@ -247,7 +247,7 @@ def test_an_environment_gets_its_arguments(mine: list[str], capsys: pytest.Captu
     assert (record.success, record.steps, record.max_steps) == (True, 5, 20)
     assert (record.env_kwargs, record.image_key) == ({"obs_type": "pixels", "win": 1.0}, "front")
     assert (record.batch, record.device, record.schema) == (1, "cpu", 2)
-    for changed in (["--image-key", "wrist"], ["--max-steps", "5"], ["--success-reward", "0.5"]):
+    for changed in (["--image-key", "wrist"], ["--max-steps", "5"], ["--success", "reward>=0.5"]):
         assert cli.main([*mine, *changed]) == 2
         assert "holds records of another run" in capsys.readouterr().err
     assert cli.main([*mine, "--image-key", "side"]) == 2
@@ -258,8 +258,8 @@ def test_an_environment_gets_its_arguments(mine: list[str], capsys: pytest.Captu
 def test_where_every_step_costs_success_has_to_be_said(mine: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     mine += ["--env-kwargs", "obs_type=pixels", "--image-key", "front"]
     assert cli.main(mine) == 2
-    assert "--success-reward 0" in capsys.readouterr().err
-    assert cli.main([*mine, "--success-reward", "0", "--video"]) == 0
+    assert "--success 'reward>=0'" in capsys.readouterr().err
+    assert cli.main([*mine, "--success", "reward>=0", "--video"]) == 0
     (path,) = Path("runs/records").rglob("*.jsonl")
     assert [(record.success, record.steps) for record in read_records(path)] == [(True, 5)]
     (video,) = Path("runs/videos").rglob("*.mp4")

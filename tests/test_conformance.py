@@ -14,11 +14,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import velap.envs  # noqa: F401 - registers the tasks
+from studies.experts import uniform
 from velap.data import behaviours, worker
 from velap.data import collection as collect
 from velap.data.loading import load_store
 from velap.data.minari_io import load_positions, open_dataset
-from velap.evaluation.experts import episode, uniform
+from velap.evaluation.rollout import play_without_frames
 from velap.tasks import TASKS, Recipe
 
 pytestmark = pytest.mark.parametrize("task", list(TASKS))
@@ -184,7 +185,7 @@ def test_the_expert_solves_test_starts_and_uniform_actions_do_not(task, seed):
     """A few of the episodes of `velap study experts`."""
     world: Any = made(task).unwrapped
     policies: list[Callable[[], Any]] = [world.expert_action, uniform(world.action_space, seed)]
-    lengths = [episode(world, act, seed, TASKS[task].max_steps) for act in policies]
+    lengths = [play_without_frames(world, act, seed, TASKS[task].max_steps) for act in policies]
     assert lengths[0] is not None
     assert lengths[0] > 10
     assert lengths[1] is None

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from studies import experts
 from velap.envs.mazes.env import SpiralMaze
 from velap.envs.mazes.obstacle import ObstacleMaze
 from velap.errors import UnknownTaskError
-from velap.evaluation import experts
 from velap.tasks import get_task
 
 

@@ -16,10 +16,10 @@ import pytest
 import torch
 from rich.console import Console
 
-from studies import faults, kills, study
-from studies.faults import CASES, Case, Finding, changes, check, judge, listing, message_of
-from studies.kills import KillReport, Victim, fingerprint, kill_and_resume, leftovers, unreadable
-from studies.study import DISK_CASES, DiskCase, check_disk, report
+from studies.faults import cases, kills, study
+from studies.faults.cases import CASES, Case, Finding, changes, check, judge, listing, message_of
+from studies.faults.kills import KillReport, Victim, fingerprint, kill_and_resume, leftovers, unreadable
+from studies.faults.study import DISK_CASES, DiskCase, check_disk, report
 from velap import cli
 from velap.errors import VelapError
 from velap.runs import load_tensors, save_tensors
@@ -123,8 +123,8 @@ def test_unreadable_files_are_found(base: Path, tmp_path: Path) -> None:
     place = tmp_path / "copy"
     shutil.copytree(base, place)
     assert unreadable(place) == leftovers(place) == []
-    faults.flip(place / "run" / "model.safetensors")
-    faults.flip(faults.data_of(place) / "main_data.hdf5")
+    cases.flip(place / "run" / "model.safetensors")
+    cases.flip(cases.data_of(place) / "main_data.hdf5")
     (place / "run" / "metrics.jsonl").write_text('{"step": 1}\n{"st')
     (place / "shard.npz").write_bytes(b"PK")
     (place / "run" / ".state.safetensors.1.tmp").write_bytes(b"")

@@ -115,7 +115,7 @@ def test_a_seed_counts_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("field", "value"), [
     ("config_hash", "other"), ("checkpoint", "other"), ("env", "other"), ("image_key", "wrist"), ("max_steps", 5),
-    ("success_reward", 0.0), ("env_kwargs", {"size": 96})])
+    ("success_rule", "reward>=0"), ("env_kwargs", {"size": 96})])
 def test_records_of_another_run_are_not_mixed(tmp_path: Path, field: str, value: object) -> None:
     path = tmp_path / "r.jsonl"
     old = filled(path, 2)

@@ -14,9 +14,9 @@ import pytest
 import torch
 from rich.console import Console
 
-from studies import benchmarks, speed
-from studies.benchmarks import Measurement, in_turns, peak_memory, synthetic_store
-from studies.speed import BENCHMARKS, Benchmark, run_benchmarks
+from studies.speed import benchmarks, command
+from studies.speed.benchmarks import Measurement, in_turns, peak_memory, synthetic_store
+from studies.speed.command import BENCHMARKS, Benchmark, run_benchmarks
 from velap.config import Config, override
 from velap.data.frames import content_hash
 from velap.data.loading import load_store
@@ -38,7 +38,7 @@ def console() -> Console:
 @pytest.fixture
 def two(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two benchmarks that measure nothing."""
-    monkeypatch.setattr(speed, "BENCHMARKS", {
+    monkeypatch.setattr(command, "BENCHMARKS", {
         "fast": Benchmark(lambda device: Measurement(30.0, "steps/s", "the other one", 10.0), at_least=10),
         "slow": Benchmark(lambda device: Measurement(1.0, "ms", "the other one", 64.0), at_most=1 / 50),
     })
@@ -62,7 +62,7 @@ def test_measuring_one_keeps_the_rows_of_the_others(
 ) -> None:
     path = tmp_path / "cpu.json"
     run_benchmarks(console, path, "cpu")
-    monkeypatch.setitem(speed.BENCHMARKS, "slow", Benchmark(lambda device: Measurement(2.0, "ms", "the other one", 64.0)))
+    monkeypatch.setitem(command.BENCHMARKS, "slow", Benchmark(lambda device: Measurement(2.0, "ms", "the other one", 64.0)))
     run_benchmarks(console, path, "cpu", only=["slow"])
     assert [(row["name"], row["value"]) for row in json.loads(path.read_text())] == [("fast", 30.0), ("slow", 2.0)]
     path.write_text("[1]")

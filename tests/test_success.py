@@ -111,5 +111,5 @@ def test_what_rules_say_of_an_environments_step(
 
 
 def test_rewards_below_zero_say_nothing_without_a_rule() -> None:
-    with pytest.raises(ConfigError, match="--success-reward 0"):
+    with pytest.raises(ConfigError, match="--success 'reward>=0'"):
         success_of(-1, {})

@@ -161,7 +161,7 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
 
 def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,
              first_seed: int = 0, env: str | None = None, env_kwargs: Mapping[str, Any] | None = None,
-             image_key: str | None = None, max_steps: int | None = None, success_reward: float | None = None,
+             image_key: str | None = None, max_steps: int | None = None, success: str | None = None,
              records: Path | str = OWN_RECORDS, fresh: bool = False, batch: int = 10, device: str = "auto",
              head: Path | str | None = None) -> Summary:
     """Success rate and more over seeded test episodes; goes on where an earlier call with the same records stopped.
@@ -176,7 +176,7 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
         env_kwargs: arguments of `gymnasium.make` besides the id.
         image_key: key of the image in dict observations.
         max_steps: time limit where the environment has none, or a shorter one [steps].
-        success_reward: least reward that means success, where `info` does not tell; None takes any positive one.
+        success: what success is, a rule of `velap.data.success` such as `reward>=0`; None takes the checkpoint's.
         records: root of the record files.
         fresh: move an existing record file aside first.
         batch: environments at once.
@@ -189,5 +189,5 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
 
     what = Evaluation(task, method=method, checkpoint=None if checkpoint is None else Path(checkpoint), env=env,
                       env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=max_steps,
-                      success_reward=success_reward, device=device, head=None if head is None else Path(head))
+                      success=success, device=device, head=None if head is None else Path(head))
     return summarise(run(what, range(first_seed, first_seed + episodes), Path(records), fresh=fresh, batch=batch))

@@ -162,7 +162,7 @@ def record_problem(cell: Cell, records: Sequence[Record]) -> str:
                 f"{TRAINING}")
     expected: dict[str, Any] = {
         "task": cell.task, "method": cell.method, "preset": cell.preset, "train_seed": cell.seed, "env": task.env_id,
-        "env_kwargs": {}, "image_key": None, "max_steps": task.max_steps, "success_reward": None, "config_hash": config_hash}
+        "env_kwargs": {}, "image_key": None, "max_steps": task.max_steps, "config_hash": config_hash}
     if joint is not None:
         expected["checkpoint"] = joint[WEIGHTS_SHA256] if method.whole_checkpoint else shared_weights(joint)
     for name, value in expected.items():

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap", episodes: int = 100, first_seed: int = 0,
              env: str | None = None, env_kwargs: tuple[str, ...] = (), image_key: str | None = None,
-             max_steps: int | None = None, success_reward: float | None = None, preset: Preset = "default",
+             max_steps: int | None = None, success: str | None = None, preset: Preset = "default",
              records: Records = OWN_RECORDS, fresh: bool = False, batch: int = 10, video: bool = False,
              device: Device = "auto", settings: Settings = (), head: Path | None = None) -> None:
     """Run seeded test episodes and record each; repeat the command to go on where it stopped.
@@ -30,8 +30,8 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
         env_kwargs: Arguments of the environment, such as `obs_type=pixels`.
         image_key: Key of the image in dict observations.
         max_steps: Time limit where the environment has none, or a shorter one.
-        success_reward: Least reward that means success where the environment's info does not tell; any positive one unless
-            said.
+        success: What counts as success, such as `reward>=0`, `info:success` or `terminated`; the rule that the checkpoint
+            keeps unless said.
         fresh: Move an existing record file aside first.
         batch: Environments at once.
         video: Film the first episode as well.
@@ -42,7 +42,7 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
 
     changes = parse_settings(settings, {method: get_method(method).settings})
     what = Evaluation(task, method=method, checkpoint=checkpoint, preset=preset, env=env, env_kwargs=parse_pairs(env_kwargs),
-                      image_key=image_key, max_steps=max_steps, success_reward=success_reward, device=device,
+                      image_key=image_key, max_steps=max_steps, success=success, device=device,
                       changes=changes, head=head)
     evaluate_with_progress(what, range(first_seed, first_seed + episodes), records, fresh=fresh, batch=batch, video=video)
 
@@ -85,7 +85,7 @@ def demo(task: Positional[str] = "SpiralMaze", checkpoint: Path | None = None, e
 def diagnose(task: Positional[str | None] = None, checkpoint: Path | None = None, dataset: str | None = None,
              out: Path | None = None, episodes: int = 10, first_seed: int = 1000, env: str | None = None,
              env_kwargs: tuple[str, ...] = (), image_key: str | None = None, max_steps: int | None = None,
-             success_reward: float | None = None, device: Device = "auto", settings: Settings = ()) -> None:
+             success: str | None = None, device: Device = "auto", settings: Settings = ()) -> None:
     """Look into a trained model and its plans, and at where its episodes fail; writes pictures and a page of text.
 
     Args:
@@ -99,11 +99,11 @@ def diagnose(task: Positional[str | None] = None, checkpoint: Path | None = None
         env_kwargs: Arguments of the environment, such as `obs_type=pixels`.
         image_key: Key of the image in dict observations.
         max_steps: Time limit where the environment has none, or a shorter one.
-        success_reward: Least reward that means success where the environment's info does not tell.
+        success: What counts as success, such as `reward>=0`; the rule that the checkpoint keeps unless said.
     """
     from velap.report.diagnose.command import Request, run_diagnose
 
     run_diagnose(OUT, Request(task=task, checkpoint=checkpoint, dataset=dataset, out=out, episodes=episodes,
                               first_seed=first_seed, device=device, changes=parse_settings(settings), env=env,
                               env_kwargs=parse_pairs(env_kwargs), image_key=image_key, max_steps=max_steps,
-                              success_reward=success_reward, command=command()))
+                              success=success, command=command()))

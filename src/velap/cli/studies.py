@@ -65,7 +65,7 @@ def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device =
         json: Write them to this file as well, such as results/bench/cpu.json.
         only: Names of the benchmarks to measure, such as plan_latency_1; all unless said.
     """
-    _study("speed").run_benchmarks(OUT, json, device, only)
+    _study("speed.command").run_benchmarks(OUT, json, device, only)
 
 
 def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-latents", "server"]],

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
@@ -38,19 +39,25 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
 
 def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: str | None = None,
           preset: Preset = "default", seed: int = 0, out: Path | None = None, device: Device = "auto", resume: bool = False,
-          settings: Settings = (), method: Method = "velap", base: Path | None = None) -> None:
-    """Train on a task's dataset or on any Minari dataset with images and a sparse reward.
+          settings: Settings = (), method: Method = "velap", base: Path | None = None, success: str | None = None,
+          fit: Literal["crop", "pad", "squash"] | None = None, image_size: int = 64, mapped: bool = False) -> None:
+    """Train on a task's dataset or on any dataset of images and continuous actions.
 
     All methods share the joint training; it is done first where its checkpoint is missing. BC, IQL and IRIS then learn on
     its latents (`--set head.steps=5000` changes how) and go on by themselves after an interruption.
 
     Args:
         task: Task name; leave it out with --dataset.
-        dataset: Minari dataset id.
+        dataset: Minari dataset id, or path of a dataset in another format (LeRobot, robomimic, OGBench).
         image_key: Key of the image in dict observations.
         seed: Decides weights and batches.
         out: Run directory; runs/TASK/PRESET/seedSEED unless said.
         resume: Go on with the unfinished run in the run directory.
+        success: What counts as success, such as `reward>=0`, `info:success`, `terminated` or `labels:answers.csv`; found in
+            the data unless said.
+        fit: How images that are not square become square.
+        image_size: Side that images are resized to [px].
+        mapped: Map the frames from a file beside the dataset instead of reading them into memory.
         base: Finished checkpoint of the same task, preset, seed and data: only the policies that VELAP alone acts by are
             learnt anew.
     """
@@ -62,12 +69,13 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
 
         get_task(task)
     train_with_progress(str(task or dataset), preset=preset, seed=seed, out=out, image_key=image_key, device=device,
-                        resume=resume, settings=settings, method=method, base=base)
+                        resume=resume, settings=settings, method=method, base=base,
+                        reading={"success": success, "fit": fit, "image_size": image_size, "mapped": mapped or None})
 
 
 def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None, device: str, resume: bool,
                         settings: Sequence[Sequence[str]], image_key: str | None = None, method: str = "velap",
-                        base: Path | None = None) -> Path:
+                        base: Path | None = None, reading: Mapping[str, Any] | None = None) -> Path:
     """Train and show how far it is; returns the joint checkpoint."""
     from velap import api
     from velap.evaluation.console import TrainView
@@ -83,7 +91,7 @@ def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None
         note(f"no joint checkpoint in {directory}; it is trained first")
     with TrainView(OUT) as view:
         checkpoint = api.train(source, preset, seed, out, method=method, image_key=image_key, device=device, resume=resume,
-                               changes=changes, base=base, command=command(), on_progress=view)
+                               changes=changes, base=base, command=command(), on_progress=view, **(reading or {}))
     say(f"checkpoint {checkpoint}")
     if kind.learns:
         result = read_result(head_path(checkpoint, method))

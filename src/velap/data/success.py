@@ -158,6 +158,6 @@ def success_of(reward: float, info: Mapping[str, Any], rule: Success | str | Non
             return bool(info[key])
     if reward < 0:
         raise ConfigError(f"the environment gave the reward {reward:g} and no `success` in its info; expected 0, or a "
-                          "positive reward for success. Say what success is, such as --success-reward 0 for an "
+                          "positive reward for success. Say what success is, such as --success 'reward>=0' for an "
                           "environment that gives -1 a step and 0 at the goal.")
     return reward > 0

@@ -55,8 +55,8 @@ class Evaluation:
     """Key of the image in dict observations."""
     max_steps: int | None = None
     """Time limit [steps], where it is shorter than the environment's own or the environment has none."""
-    success_reward: float | None = None
-    """Least reward that means success; None takes the rule that the checkpoint keeps."""
+    success: str | None = None
+    """What counts as success, a rule of `velap.data.success`; None takes the one that the checkpoint keeps."""
     device: str = "auto"
     changes: dict[str, dict[str, Any]] | None = None
     """Fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`, or of the method's own settings,
@@ -81,10 +81,8 @@ class Player:
 
     @property
     def success(self) -> Success | None:
-        """What counts as success: the least reward asked for, else the rule that the checkpoint keeps."""
-        if self.key.success_reward is not None:
-            return Success("reward", least=self.key.success_reward)
-        return Success.parse(self.reading.success) if self.reading.success else None
+        """What counts as success; None: what the environment's info says, else a positive reward."""
+        return None if self.key.success_rule is None else Success.parse(self.key.success_rule)
 
     def frames_of(self, env: gym.Env[Any, Any]) -> FrameReader:
         """The reader of an environment's frames, which squares and resizes them as it was done with the data."""
@@ -131,7 +129,7 @@ def load_player(what: Evaluation) -> Player:
         env.close()
     key = RunKey(task=what.task if env_id == task_env else env_id, method=what.method, preset=config.preset,
                  train_seed=loaded.seed, env=env_id, env_kwargs=what.env_kwargs, image_key=what.image_key,
-                 max_steps=max_steps, success_reward=what.success_reward,
+                 max_steps=max_steps, success_rule=what.success or loaded.reading.success or None,
                  config_hash=method.config_hash(config, loaded.head, loaded.settings), checkpoint=loaded.digest,
                  code_version=code_version())
     return Player(agent=agent, model=model, config=config, key=key, image_size=size, reading=loaded.reading,

@@ -24,10 +24,10 @@ from velap.tasks import TASKS
 
 SCHEMA = 2
 """Version of a line. Schema 1 had no `schema` and none of `_NEW_IN_2`."""
-IDENTITY = ("task", "method", "preset", "train_seed", "env", "env_kwargs", "image_key", "max_steps", "success_reward",
+IDENTITY = ("task", "method", "preset", "train_seed", "env", "env_kwargs", "image_key", "max_steps", "success_rule",
             "config_hash", "checkpoint")
 """Fields that every record of one file shares."""
-_NEW_IN_2: dict[str, Any] = {"env_kwargs": {}, "image_key": None, "success_reward": None, "batch": None, "device": None}
+_NEW_IN_2: dict[str, Any] = {"env_kwargs": {}, "image_key": None, "success_rule": None, "batch": None, "device": None}
 """Fields that schema 1 did not have, with what its records stand for: no options, and an unknown batch and device."""
 
 
@@ -59,8 +59,8 @@ class RunKey:
     """Key of the image in dict observations."""
     max_steps: int | None = None
     """Time limit [steps]; None only in records of schema 1 that do not tell it."""
-    success_reward: float | None = None
-    """Least reward that means success; None: any positive one."""
+    success_rule: str | None = None
+    """What counts as success, a rule of `velap.data.success`; None: the info's word, else a positive reward."""
 
     def path(self, root: Path) -> Path:
         """Its record file below `root`."""

@@ -164,3 +164,9 @@ def make_envs(make: Callable[[], gym.Env[Any, Any]], count: int) -> list[gym.Env
             env.close()
         raise
     return envs
+
+
+def play_without_frames(world: Any, act: Callable[[], NDArray[np.floating[Any]]], seed: int, max_steps: int) -> int | None:
+    """Steps to success of a task of ours from the test start of that seed; None without success by `max_steps` [steps]."""
+    world.start({"split": "test"}, seed)
+    return next((step for step in range(1, max_steps + 1) if world.advance(act())), None)

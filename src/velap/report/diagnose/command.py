@@ -79,8 +79,8 @@ class Request:
     image_key: str | None = None
     max_steps: int | None = None
     """Time limit where the environment has none, or a shorter one [steps]."""
-    success_reward: float | None = None
-    """Least reward that means success."""
+    success: str | None = None
+    """What counts as success, a rule of `velap.data.success`."""
     command: str = "velap diagnose"
 
 
@@ -147,7 +147,7 @@ def resolve(request: Request) -> _Subject:
         changes = dict(request.changes or {})
         evaluation = Evaluation(task, checkpoint=checkpoint, env=env, env_kwargs=request.env_kwargs,
                                 image_key=request.image_key, max_steps=request.max_steps,
-                                success_reward=request.success_reward, device=request.device, changes=changes)
+                                success=request.success, device=request.device, changes=changes)
     return _Subject(task, checkpoint, dataset_id, evaluation)
 
 

@@ -20,8 +20,7 @@ from velap.envs.mazes.env import STEP_LENGTH
 from velap.envs.mazes.geometry import Layout, Rect
 from velap.envs.protocol import Expert, Mapped, Walled
 from velap.evaluation.evaluate import Player, reset_options
-from velap.evaluation.experts import episode
-from velap.evaluation.rollout import FrameReader
+from velap.evaluation.rollout import FrameReader, play_without_frames
 from velap.models.velap import LatentModel
 from velap.report.diagnose.model import Album, ValueCurve, local_steps, rank_correlation, value_curve
 from velap.report.diagnose.plans import Starts
@@ -143,7 +142,7 @@ def expert_curves(model: LatentModel, env: gym.Env[Any, Any], frame_stack: int, 
             done.append(np.clip(world.expert_action(), space.low, space.high))
             return done[-1]
 
-        if episode(world, act, seed, env.spec.max_episode_steps) is None:
+        if play_without_frames(world, act, seed, env.spec.max_episode_steps) is None:
             continue
         stacks = torch.from_numpy(stack_all([*frames, world.render()], frame_stack))
         actions = torch.from_numpy(np.stack([*taken, np.zeros_like(taken[0])]).astype(np.float32)).to(device)

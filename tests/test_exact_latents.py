@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 
 import velap.envs  # noqa: F401 - registers the tasks
-from studies.exact import ExactEncoder, collect_states, pack, study_exact_latents, unpack
+from studies.exact_latents import ExactEncoder, collect_states, pack, study_exact_latents, unpack
 from velap.data.behaviours import position_of, run_trajectory
 from velap.data.frames import stack_indices
 from velap.errors import ConfigError

@@ -37,7 +37,7 @@ TRAJECTORIES = 120
 """Trajectories of the shrunk recipe: some reach the goal."""
 FILE_LIMIT, KILL_AT = "VELAP_FILE_LIMIT", "VELAP_KILL_AT_FSYNC"
 """Environment variables of `shrunk_main`: largest file [bytes], number of the fsync to die at."""
-CODE = "import sys; from studies.kills import shrunk_main; from velap.cli import main; sys.exit(shrunk_main(main))"
+CODE = "import sys; from studies.faults.kills import shrunk_main; from velap.cli import main; sys.exit(shrunk_main(main))"
 
 
 def shrink() -> None:

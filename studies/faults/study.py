@@ -14,8 +14,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from rich.console import Console
 
-from studies.faults import CASES, DATASET, Finding, Outcome, Run, check, judge, message_of, shown
-from studies.kills import (
+from studies.faults.cases import CASES, DATASET, Finding, Outcome, Run, check, judge, message_of, shown
+from studies.faults.kills import (
     FILE_LIMIT,
     SMALL,
     TRAJECTORIES,

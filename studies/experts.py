@@ -21,6 +21,7 @@ import velap.envs  # noqa: F401 - registers the tasks
 from velap.envs.mazes.geometry import Layout
 from velap.envs.protocol import Walled
 from velap.evaluation.console import View
+from velap.evaluation.rollout import play_without_frames
 from velap.runs import write_atomic
 from velap.tasks import TASKS, Task, get_task
 
@@ -57,12 +58,6 @@ class Trials:
     slides along walls."""
     other_straight: int | None = None
     """`straight` for the seeds of `OTHER_SEEDS`."""
-
-
-def episode(world: Any, act: Callable[[], NDArray[np.floating[Any]]], seed: int, max_steps: int) -> int | None:
-    """Steps to success from the test start of that seed; None when there is none within `max_steps` [steps]."""
-    world.start({"split": "test"}, seed)
-    return next((step for step in range(1, max_steps + 1) if world.advance(act())), None)
 
 
 def uniform(space: gym.spaces.Box, seed: int) -> Callable[[], NDArray[np.floating[Any]]]:
@@ -111,9 +106,9 @@ def try_task(task: Task, seeds: Sequence[int], on_episode: Callable[[int], objec
     lengths, lucky, held = [], 0, 0
     maze = isinstance(world, Walled)
     for seed in seeds:
-        length = episode(world, world.expert_action, seed, task.max_steps)
+        length = play_without_frames(world, world.expert_action, seed, task.max_steps)
         lengths += [] if length is None else [length]
-        lucky += episode(world, uniform(world.action_space, seed), seed, task.max_steps) is not None
+        lucky += play_without_frames(world, uniform(world.action_space, seed), seed, task.max_steps) is not None
         held += maze and heading_solves(world, seed, task.max_steps)
         on_episode(seed)
     lines: dict[str, int] = {}

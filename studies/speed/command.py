@@ -1,6 +1,6 @@
 """`velap bench`: speed ratios measured side by side, printed and written as JSON.
 
-A benchmark is a function of `studies.benchmarks` with a line in `BENCHMARKS`.
+A benchmark is a function of `studies.speed.benchmarks` with a line in `BENCHMARKS`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from studies import benchmarks
-from studies.benchmarks import Measurement
+from studies.speed import benchmarks
+from studies.speed.benchmarks import Measurement
 from velap.errors import ConfigError
 from velap.runs import write_atomic
 from velap.threads import usable_cores

@@ -363,7 +363,7 @@ def train_rss(device: torch.device) -> Measurement:
 
 def _child(call: str, datasets: str) -> str:
     """The last line that a function of this module prints in a process of its own."""
-    code = f"from studies.benchmarks import *; {call}"
+    code = f"from studies.speed.benchmarks import *; {call}"
     done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "MINARI_DATASETS_PATH": datasets},
                           capture_output=True, text=True)
     if done.returncode:
