@@ -28,7 +28,7 @@ from velap.data.frames import FrameStore
 from velap.data.sampling import WindowSampler
 from velap.envs.protocol import WithTrueState
 from velap.errors import ConfigError
-from velap.evaluation.console import View
+from velap.evaluation.console import ProgressBar
 from velap.evaluation.evaluate import make_env, reset_options
 from velap.evaluation.rollout import FrameReader, Rollout, make_envs
 from velap.methods.base import make_agent
@@ -77,7 +77,7 @@ class States:
     """How many of the entries after the hand's three are joints."""
 
 
-def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: View | None = None) -> States:
+def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: ProgressBar | None = None) -> States:
     """The trajectories that `velap collect` records, step for step, without drawing; `contexts` of them all where given."""
     env: Any = make_env(task.env_id).unwrapped
     if not isinstance(env.unwrapped, WithTrueState):
@@ -138,7 +138,7 @@ class ExactEncoder:
         return latent
 
 
-def learn(data: States, config: Config, seed: int, view: View | None = None) -> LatentModel:
+def learn(data: States, config: Config, seed: int, view: ProgressBar | None = None) -> LatentModel:
     """A model in eval mode, taught by all phases of the config that work on a frozen encoder."""
     train = dataclasses.replace(config.train, encoder_steps=0, joint_steps=0, reconstruction=0.0)
     device = torch.device("cpu")
@@ -166,7 +166,8 @@ def learn(data: States, config: Config, seed: int, view: View | None = None) -> 
     return model
 
 
-def play(task: Task, model: LatentModel, config: Config, method: str, seeds: range, view: View | None = None) -> list[Any]:
+def play(task: Task, model: LatentModel, config: Config, *, method: str, seeds: range,
+         view: ProgressBar | None = None) -> list[Any]:
     """Episodes of a method that sees packed states."""
     def make() -> gym.Env[Any, Any]:
         env = make_env(task.env_id)
@@ -193,16 +194,16 @@ def study_exact_latents(
     task = get_task(name)
     config = override(make_config(name), **(changes or {}))
     began = time.monotonic()
-    with View(console, f"states of {name}", contexts or task.recipe.contexts) as view:
+    with ProgressBar(console, f"states of {name}", contexts or task.recipe.contexts) as view:
         data = collect_states(task, contexts, view=view)
     steps = sum(count for phase, count in config.train.phases if phase not in ("encoder", "joint"))
-    with View(console, "exact latents", steps) as view:
+    with ProgressBar(console, "exact latents", steps) as view:
         model = learn(data, config, seed, view)
     seeds = range(FIRST_SEED, FIRST_SEED + (QUICK_EPISODES if quick else EPISODES))
     rows: list[dict[str, Any]] = []
     for method in METHODS:
-        with View(console, f"{method} on {name}", len(seeds)) as view:
-            episodes = play(task, model, config, method, seeds, view)
+        with ProgressBar(console, f"{method} on {name}", len(seeds)) as view:
+            episodes = play(task, model, config, method=method, seeds=seeds, view=view)
         rows.append({"task": name, "method": method, "train_seed": seed, "first_seed": seeds[0], "episodes": len(episodes),
                      "solved": sum(episode.success for episode in episodes),
                      "mean_steps": float(np.mean([episode.steps for episode in episodes])), "config_hash": config.hash()})

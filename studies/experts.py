@@ -20,7 +20,7 @@ from rich.console import Console
 import velap.envs  # noqa: F401 - registers the tasks
 from velap.envs.mazes.geometry import Layout
 from velap.envs.protocol import Walled
-from velap.evaluation.console import View
+from velap.evaluation.console import ProgressBar
 from velap.evaluation.rollout import play_without_frames
 from velap.runs import write_atomic
 from velap.tasks import TASKS, Task, get_task
@@ -34,7 +34,7 @@ _STALLED = 1e-4
 """A block that moves less in a step at top speed [m] is stuck for good."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Trials:
     """How one task went."""
 
@@ -114,8 +114,16 @@ def try_task(task: Task, seeds: Sequence[int], on_episode: Callable[[int], objec
     lines: dict[str, int] = {}
     if maze:
         lines = {"straight": _sight_lines(world, seeds), "held": held, "other_straight": _sight_lines(world, OTHER_SEEDS)}
-    return Trials(task.name, seeds[0], len(seeds), task.max_steps, len(lengths),
-                  float(np.mean(lengths)) if lengths else None, max(lengths, default=0), lucky, **lines)
+    return Trials(
+        task=task.name,
+        first_seed=seeds[0],
+        episodes=len(seeds),
+        max_steps=task.max_steps,
+        expert=len(lengths),
+        expert_steps=float(np.mean(lengths)) if lengths else None,
+        longest=max(lengths, default=0),
+        random=lucky,
+        **lines)
 
 
 def study_experts(console: Console, quick: bool = False, first_seed: int = 0, write: Path | None = None,
@@ -123,7 +131,7 @@ def study_experts(console: Console, quick: bool = False, first_seed: int = 0, wr
     """Try every task, print the report, and write it as a document and as JSON where asked."""
     count = QUICK_EPISODES if quick else EPISODES
     seeds, done, trials = range(first_seed, first_seed + count), 0, []
-    with View(console, "experts", count * len(tasks)) as view:
+    with ProgressBar(console, "experts", count * len(tasks)) as view:
         for name in tasks:
             trials.append(try_task(get_task(name), seeds, lambda seed: view.show(done + seed - first_seed + 1)))  # noqa: B023
             done += count

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from test_cli import untrained
 from toy_env import toy_config, toy_player
 from toy_world import GOAL, START, toy_fns
 from velap import cli
-from velap.config import ModelConfig
+from velap.config import Config, ModelConfig
 from velap.config.training import TrainConfig
 from velap.data.frames import FrameStore
 from velap.data.sampling import WindowSampler
@@ -26,18 +27,19 @@ from velap.envs.mazes.env import STEP_LENGTH, SpiralMaze
 from velap.envs.sawyer.tasks import DrawerButton
 from velap.evaluation.rollout import FrameReader
 from velap.report import demo
+from velap.report.diagnose import failures, text
 from velap.report.diagnose.failures import CLASSES, REMEDIES, Trace, classify, judge, watch
 from velap.report.diagnose.model import (
     LED,
-    Album,
-    Pairs,
+    RealStates,
     Recorded,
+    StatePairs,
     ValueCurve,
     action_values,
-    album_of,
     encode_states,
     other_pairs,
     rank_correlation,
+    real_states_of,
     rollout_error,
 )
 from velap.report.diagnose.plans import Starts, plan_strip, tree_numbers
@@ -93,7 +95,7 @@ def line_recorded(looked_at: list[int]) -> Recorded:
     held_out = np.array(looked_at)
     sampler = WindowSampler(store, TrainConfig(), 1, torch.device("cpu"), held_out)
     positions = store.frames[:, 0, 0, :2].astype(np.float32) * (1, 0)
-    return Recorded(store, sampler, held_out, True, positions.astype(np.float32))
+    return Recorded(store=store, sampler=sampler, episodes=held_out, held_out=True, positions=positions.astype(np.float32))
 
 
 def test_rollout_error_displacement_and_local_steps_are_exact() -> None:
@@ -125,7 +127,10 @@ def test_pairs_of_other_trajectories_come_from_near_and_from_far() -> None:
 
 
 def test_aliasing_counts_states_that_are_truly_apart() -> None:
-    pairs = Pairs("x", np.array([1.0, 1.0, 9.0, 9.0, 2.0]), np.array([20.0, 1.0, 20.0, 1.0, 6.1]))
+    pairs = StatePairs(
+        name="x",
+        local_steps=np.array([1.0, 1.0, 9.0, 9.0, 2.0]),
+        least_steps=np.array([20.0, 1.0, 20.0, 1.0, 6.1]))
     assert pairs.arrived(3.0) == 0.6
     assert pairs.aliased(3.0) == pytest.approx(2 / 3)
     assert pairs.aliased(30.0) is None
@@ -158,7 +163,7 @@ def test_promises_of_actions_are_compared_with_what_comes_of_them() -> None:
     store = FrameStore.from_arrays(frames=frames, actions=actions, rewards=rewards, terminated=never, truncated=truncated,
                                    episode_length=[len(walk) for walk in walks], action_low=[-1.0], action_high=[1.0])
     sampler = WindowSampler(store, TrainConfig(), 1, torch.device("cpu"), np.arange(3))
-    recorded = Recorded(store, sampler, np.arange(3), True, None)
+    recorded = Recorded(store=store, sampler=sampler, episodes=np.arange(3), held_out=True, positions=None)
     model: Any = ClimbingModel()
     latents = encode_states(model, recorded.sampler, recorded.rows)
     found = action_values(model, recorded, latents)
@@ -189,12 +194,15 @@ def test_rank_correlation_and_values_along_an_episode() -> None:
 
 def test_an_album_finds_the_nearest_real_state_and_holds_none_that_is_looked_at() -> None:
     recorded, model = line_recorded([0]), LineModel()
-    album = album_of(model, recorded, np.random.default_rng(0), 1000)  # type: ignore[arg-type]
-    frames, distances = album.nearest(torch.tensor([[60.4], [3.0]]))
+    real_states = real_states_of(model, recorded, np.random.default_rng(0), 1000)  # type: ignore[arg-type]
+    frames, distances = real_states.nearest(torch.tensor([[60.4], [3.0]]))
     assert frames[:, 0, 0, 0].tolist() == [60, 20]
     np.testing.assert_allclose(distances, [0.4, 17], atol=1e-4)
     assert encode_states(model, recorded.sampler, np.array([0, 25])).tolist() == [[0.0], [24.0]]  # type: ignore[arg-type]
-    assert Album("x", torch.tensor([[0.0], [1.0], [5.0]]), frames).spacing() == pytest.approx((1 + 1 + 4) / 3)
+    assert RealStates(
+        source="x",
+        latents=torch.tensor([[0.0], [1.0], [5.0]]),
+        frames=frames).spacing() == pytest.approx((1 + 1 + 4) / 3)
 
 
 def test_shortest_ways_between_points_of_a_maze() -> None:
@@ -253,14 +261,17 @@ def test_trees_in_numbers_and_as_a_strip() -> None:
     config = toy_config().planner
     result = plan(toy_fns(), roots, config, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
     grid = torch.cartesian_prod(torch.arange(-10.0, 11), torch.arange(-10.0, 11)).double()
-    album = Album("a grid", grid, (grid.numpy()[:, None, None, :1] + 10).repeat(3, -1).astype(np.uint8))
+    real_states = RealStates(
+        source="a grid",
+        latents=grid,
+        frames=(grid.numpy()[:, None, None, :1] + 10).repeat(3, -1).astype(np.uint8))
     starts = Starts(("one", "two"), np.full((2, 1, 1, 1, 3), 77, np.uint8))
-    first, second = tree_numbers(starts, result, album, 0.5)
+    first, second = tree_numbers(starts, result, real_states, 0.5)
     assert first.nodes - 1 + sum(first.rejected.values()) == config.n_iter
     nodes = result.tree.latents[0, : first.nodes]
     assert first.distance == pytest.approx(float(torch.cdist(nodes, grid).amin(1).mean()) / 0.5)
     assert second.reached_goal and second.waypoints == 0 and second.start_value == pytest.approx(1)
-    strip = plan_strip(starts, result, album, 0.5)
+    strip = plan_strip(starts, result, real_states, 0.5)
     assert len(strip.frames) == len(strip.captions) == first.waypoints + 1
     assert strip.frames[0, 0, 0, 0] == 77
     np.testing.assert_allclose(strip.frames[1:, 0, 0, 0] - 10.0, result.waypoints[0, 1 : len(strip.frames), 0], atol=0.51)
@@ -405,3 +416,10 @@ def test_errors_are_one_paragraph_and_leave_nothing(arguments: list[str], text: 
     assert text in message
     assert message.startswith("velap: ")
     assert not Path("runs").exists()
+
+
+def test_every_config_field_that_advice_names_exists() -> None:
+    config = Config(task="x", preset="default")
+    for module in (text, failures):
+        for part, name in re.findall(r"\b(model|train|planner|controller)\.([a-z_0-9]+)", Path(module.__file__).read_text()):
+            assert hasattr(getattr(config, part), name), f"{part}.{name} in {module.__name__}"

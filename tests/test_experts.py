@@ -55,8 +55,27 @@ def test_a_task_without_walls_has_no_straight_lines():
 
 
 def test_the_report_and_the_figures_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    trials = experts.Trials("ObstacleMaze", 5, 10, 100, 9, 51.25, 69, 1, 2, 3, 400)
-    arm = experts.Trials("WindowClose", 5, 10, 150, 10, 90.0, 99, 0)
+    trials = experts.Trials(
+        task="ObstacleMaze",
+        first_seed=5,
+        episodes=10,
+        max_steps=100,
+        expert=9,
+        expert_steps=51.25,
+        longest=69,
+        random=1,
+        straight=2,
+        held=3,
+        other_straight=400)
+    arm = experts.Trials(
+        task="WindowClose",
+        first_seed=5,
+        episodes=10,
+        max_steps=150,
+        expert=10,
+        expert_steps=90.0,
+        longest=99,
+        random=0)
     made = iter((trials, arm))
     monkeypatch.setattr(experts, "try_task", lambda task, seeds, on_episode: next(made))
     experts.study_experts(Console(), True, 5, tmp_path / "a.md", tmp_path / "a.json", ("ObstacleMaze", "WindowClose"))

@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 
 from studies.faults import cases, kills, study
-from studies.faults.cases import CASES, Case, Finding, changes, check, judge, listing, message_of
+from studies.faults.cases import CASES, Case, CaseResult, changes, check, judge, listing, message_of
 from studies.faults.kills import KillReport, Victim, fingerprint, kill_and_resume, leftovers, unreadable
 from studies.faults.study import DISK_CASES, DiskCase, check_disk, report
 from velap import cli
@@ -69,14 +69,14 @@ def run_here(arguments: Sequence[str], place: Path, datasets: str = "datasets", 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.fault.replace(" ", "-"))
 def test_a_fault_is_one_paragraph_and_leaves_nothing(case: Case, base: Path, tmp_path: Path) -> None:
-    finding = check(case, base, tmp_path / "case", run_here)
-    assert finding.problems == (), finding.message
+    result = check(case, base, tmp_path / "case", run_here)
+    assert result.problems == (), result.message
 
 
 def test_killed_training_resumes_to_the_same_bits(base: Path, tmp_path: Path) -> None:
     train = ("train", "SpiralMaze", "--out", "run")
     done: list[int] = []
-    victim = Victim(train, (*train, "--resume"), base / "datasets", 24)
+    victim = Victim(arguments=train, resume=(*train, "--resume"), datasets=base / "datasets", fsyncs=24)
     result = kill_and_resume(victim, tmp_path, 1, np.random.default_rng(5), done.append)
     assert result.problems == ()
     assert result.kills == 1
@@ -86,9 +86,9 @@ def test_killed_training_resumes_to_the_same_bits(base: Path, tmp_path: Path) ->
 
 @pytest.mark.parametrize("case", DISK_CASES, ids=lambda case: case.fault.replace(" ", "-"))
 def test_a_full_disk_is_survived(case: DiskCase, base: Path, tmp_path: Path) -> None:
-    finding = check_disk(case, base, tmp_path / "case", run_here, mount=False)
-    assert finding.problems == (), finding.message
-    assert re.search("(cannot|could not) write", finding.message)
+    result = check_disk(case, base, tmp_path / "case", run_here, mount=False)
+    assert result.problems == (), result.message
+    assert re.search("(cannot|could not) write", result.message)
 
 
 # the judge itself
@@ -146,8 +146,13 @@ def test_the_fingerprint_holds_weights_and_losses_but_no_times(base: Path, tmp_p
 
 
 def test_the_report_shows_commands_messages_and_problems() -> None:
-    text = report("velap study faults", [KillReport("velap train", 20, (), "f")],
-                  [Finding("a | b", "velap fly", "m" * 1000, 2, ()), Finding("bad", "velap x", "no", 0, ("exit code 0",))])
+    text = report("velap study faults", [KillReport(command="velap train", kills=20, problems=(), fingerprint="f")],
+                  [CaseResult(fault="a | b", command="velap fly", message="m" * 1000, code=2, problems=()), CaseResult(
+                      fault="bad",
+                      command="velap x",
+                      message="no",
+                      code=0,
+                      problems=("exit code 0",))])
     assert "`velap study faults --write docs/faults.md`" in text
     assert "| `velap train` | 20 | as it should be |" in text
     assert "| bad | `velap x` | no | 0 | exit code 0 |" in text
@@ -155,8 +160,17 @@ def test_the_report_shows_commands_messages_and_problems() -> None:
 
 
 def test_a_study_with_problems_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(study, "_kill", lambda *arguments: [KillReport("velap train", 2, ("other bits",), "f")])
-    monkeypatch.setattr(study, "_spoil", lambda *arguments: [Finding("disk full", "velap train", "no", 2, ())])
+    monkeypatch.setattr(study, "_kill", lambda *arguments: [KillReport(
+        command="velap train",
+        kills=2,
+        problems=("other bits",),
+        fingerprint="f")])
+    monkeypatch.setattr(study, "_spoil", lambda *arguments: [CaseResult(
+        fault="disk full",
+        command="velap train",
+        message="no",
+        code=2,
+        problems=())])
     console = Console(record=True, file=io.StringIO())
     with pytest.raises(VelapError, match="1 problems in 2 faults"):
         study.study_faults(console, quick=True, seed=3, write=tmp_path / "faults.md")

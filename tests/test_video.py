@@ -30,7 +30,8 @@ def test_positions_and_pixels_agree() -> None:
 def test_a_latent_map_locates_latents_and_knows_their_value() -> None:
     env = toy_env()
     assert can_probe(env)
-    latent_map = probe(ToyModel(), env, FrameReader(env, SIDE), 2, np.random.default_rng(0), 500)  # type: ignore[arg-type]
+    latent_map = probe(ToyModel(), env, FrameReader(env, SIDE), frame_stack=2,  # type: ignore[arg-type]
+                       rng=np.random.default_rng(0), count=500)
     assert latent_map.latents.shape == (500, 2)
     # the toy's latents are its positions, up to a pixel's rounding of 0.04
     np.testing.assert_allclose(latent_map.latents, latent_map.positions, atol=0.05)
@@ -64,7 +65,8 @@ def test_the_picture_of_a_plan(tmp_path: Path) -> None:
     fns = SearchFns(**ToyModel().search_fns())  # type: ignore[arg-type]
     roots = torch.tensor([GOAL, (-3.0, 0.0)], dtype=torch.float64)
     result = plan(fns, roots, player.config.planner, torch.Generator().manual_seed(0))
-    plan_figure(tmp_path / "plan.png", np.full((8, 8, 3), 200, np.uint8), result, 1, latent_map, "title")
+    plan_figure(tmp_path / "plan.png", frame=np.full((8, 8, 3), 200, np.uint8), plan=result, row=1, latent_map=latent_map,
+                title="title")
     image = imageio.imread(tmp_path / "plan.png")
     assert image.shape[:2] == (550, 1650)
     assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 200
@@ -82,7 +84,8 @@ def test_the_demo_solves_films_and_draws(tmp_path: Path, monkeypatch: pytest.Mon
 
 def probe_few(player: Player) -> LatentMap:
     env = player.make_env()
-    return probe(player.model, env, FrameReader(env, SIDE), 2, np.random.default_rng(0), 150)  # type: ignore[arg-type]
+    return probe(player.model, env, FrameReader(env, SIDE), frame_stack=2,  # type: ignore[arg-type]
+                 rng=np.random.default_rng(0), count=150)
 
 
 def test_a_missing_release_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,15 +23,15 @@ TRAIN = ("train", "--dataset", DATASET, "--out", "new")
 RESUME = ("train", "SpiralMaze", "--out", "run", "--resume")
 EVALUATE = ("evaluate", "SpiralMaze", "--episodes", "1", "--checkpoint", "run/model.safetensors")
 
-Outcome = tuple[int, str]
+Answer = tuple[int, str]
 """Exit code and stderr of a command."""
 
 
-class Run(Protocol):
+class RunCommand(Protocol):
     """Runs `velap arguments`."""
 
     def __call__(self, arguments: Sequence[str], place: Path, datasets: str = "datasets",
-                 limit: int | None = None) -> Outcome:
+                 limit: int | None = None) -> Answer:
         """In the folder `place`, with Minari's root `datasets` in it; no file may grow beyond `limit` [bytes]."""
         ...
 
@@ -49,8 +49,8 @@ class Case:
     """Brings the fault about in a folder that holds copies of `datasets` and `run`."""
 
 
-@dataclass(frozen=True)
-class Finding:
+@dataclass(frozen=True, kw_only=True)
+class CaseResult:
     """What came of one case."""
 
     fault: str
@@ -243,7 +243,7 @@ def message_of(stderr: str) -> str:
     return " ".join(re.sub(r"[─│╭╮╰╯]+|-{4,}", " ", " ".join(lines)).split())
 
 
-def check(case: Case, base: Path, place: Path, run: Run) -> Finding:
+def check(case: Case, base: Path, place: Path, run: RunCommand) -> CaseResult:
     """Copy `base` (with `datasets` and `run`) to `place`, spoil it, run the command and judge."""
     shutil.copytree(base, place)
     case.spoil(place)
@@ -251,8 +251,12 @@ def check(case: Case, base: Path, place: Path, run: Run) -> Finding:
     code, stderr = run(case.arguments, place)
     after = listing(place)
     shutil.rmtree(place)
-    return Finding(case.fault, shown(case.arguments), message_of(stderr).replace(str(place), "FOLDER"), code,
-                   (*judge(code, stderr, case.says), *changes(before, after)))
+    return CaseResult(
+        fault=case.fault,
+        command=shown(case.arguments),
+        message=message_of(stderr).replace(str(place), "FOLDER"),
+        code=code,
+        problems=(*judge(code, stderr, case.says), *changes(before, after)))
 
 
 def shown(arguments: Sequence[str]) -> str:

@@ -136,9 +136,9 @@ def fingerprint(folder: Path) -> str:
     return digest.hexdigest()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class KillReport:
-    """Outcome of the kills of one command."""
+    """Answer of the kills of one command."""
 
     command: str
     kills: int
@@ -147,7 +147,7 @@ class KillReport:
     """Of the uninterrupted run, and of every resumed one if there is no problem."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Victim:
     """A command to kill."""
 
@@ -196,7 +196,11 @@ def kill_and_resume(victim: Victim, folder: Path, kills: int, rng: np.random.Gen
         on_kill(killed)
     if killed < kills:
         problems.append(f"{finished} runs ended before they were killed")
-    return KillReport("velap " + " ".join(victim.arguments), killed, tuple(problems), expected)
+    return KillReport(
+        command="velap " + " ".join(victim.arguments),
+        kills=killed,
+        problems=tuple(problems),
+        fingerprint=expected)
 
 
 def _start_and_kill(victim: Victim, place: Path, at_fsync: bool, seconds: float, rng: np.random.Generator) -> bool:

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from rich.console import Console
 
-from studies.faults.cases import CASES, DATASET, Finding, Outcome, Run, check, judge, message_of, shown
+from studies.faults.cases import CASES, DATASET, Answer, CaseResult, RunCommand, check, judge, message_of, shown
 from studies.faults.kills import (
     FILE_LIMIT,
     SMALL,
@@ -28,7 +28,7 @@ from studies.faults.kills import (
     unreadable,
 )
 from velap.errors import VelapError
-from velap.evaluation.console import View
+from velap.evaluation.console import ProgressBar
 from velap.runs import write_atomic
 
 KILLS, QUICK_KILLS = 20, 2
@@ -38,7 +38,7 @@ MESSAGE = 420
 """Longest message shown in the report [characters]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DiskCase:
     """A command that runs out of disk below the folder `disk`."""
 
@@ -57,10 +57,21 @@ class DiskCase:
 RECORD = ("evaluate", "SpiralMaze", "--episodes", "1", "--max-steps", "3", "--checkpoint", "run/model.safetensors",
           "--records", "disk/records")
 DISK_CASES = (
-    DiskCase("disk full while collecting", ("collect", "SpiralMaze"), ("collect", "SpiralMaze"), "disk", 20_000, "datasets"),
-    DiskCase("disk full while training", ("train", "SpiralMaze", "--out", "disk/run"),
-             ("train", "SpiralMaze", "--out", "disk/run", "--resume"), "datasets", 100_000, "run"),
-    DiskCase("disk full while evaluating", RECORD, RECORD, "datasets", 0, ""),
+    DiskCase(
+        fault="disk full while collecting",
+        arguments=("collect", "SpiralMaze"),
+        again=("collect", "SpiralMaze"),
+        datasets="disk",
+        free=20_000,
+        result="datasets"),
+    DiskCase(
+        fault="disk full while training",
+        arguments=("train", "SpiralMaze", "--out", "disk/run"),
+        again=("train", "SpiralMaze", "--out", "disk/run", "--resume"),
+        datasets="datasets",
+        free=100_000,
+        result="run"),
+    DiskCase(fault="disk full while evaluating", arguments=RECORD, again=RECORD, datasets="datasets", free=0, result=""),
 )
 
 
@@ -87,7 +98,7 @@ def full_disk(folder: Path, free: int, mount: bool = True) -> Iterator[int | Non
     shutil.copytree(kept, folder, dirs_exist_ok=True)
 
 
-def check_disk(case: DiskCase, base: Path, place: Path, run: Run, mount: bool = True) -> Finding:
+def check_disk(case: DiskCase, base: Path, place: Path, run: RunCommand, mount: bool = True) -> CaseResult:
     """Run a command onto a full disk, judge what it says and leaves, and let it go on with room."""
     shutil.copytree(base, place)
     disk = place / "disk"
@@ -104,11 +115,11 @@ def check_disk(case: DiskCase, base: Path, place: Path, run: Run, mount: bool = 
             problems.append("with room it ends with other bits")
     shutil.rmtree(place)
     message = message_of(stderr).replace(str(place), "FOLDER")
-    return Finding(case.fault, shown(case.arguments), message, code, tuple(problems))
+    return CaseResult(fault=case.fault, command=shown(case.arguments), message=message, code=code, problems=tuple(problems))
 
 
-def run_alone(arguments: Sequence[str], place: Path, datasets: str = "datasets", limit: int | None = None) -> Outcome:
-    """A `Run` in a process of its own."""
+def run_alone(arguments: Sequence[str], place: Path, datasets: str = "datasets", limit: int | None = None) -> Answer:
+    """A `RunCommand` in a process of its own."""
     process = start(arguments, place, place / datasets, **({} if limit is None else {FILE_LIMIT: str(limit)}))
     _, stderr = process.communicate()
     return process.returncode, stderr
@@ -118,53 +129,53 @@ def study_faults(console: Console, quick: bool = False, seed: int = 0, write: Pa
     """Run everything, print what went wrong, and write the report; raises VelapError when something did."""
     kills = QUICK_KILLS if quick else KILLS
     total = 2 * kills + len(CASES) + len(DISK_CASES)
-    with TemporaryDirectory() as folder, View(console, "faults", total) as view:
+    with TemporaryDirectory() as folder, ProgressBar(console, "faults", total) as view:
         reports = _kill(Path(folder), kills, np.random.default_rng(seed), view)
-        findings = _spoil(Path(folder), 2 * kills, view)
+        results = _spoil(Path(folder), 2 * kills, view)
     command = "velap study faults" + (" --quick" if quick else "") + (f" --seed {seed}" if seed else "")
     if write is not None:
-        write_atomic(write, report(command, reports, findings).encode())
+        write_atomic(write, report(command, reports, results).encode())
         console.print(f"report {write}", markup=False)
     bad = [f"{entry.command}: {problem}" for entry in reports for problem in entry.problems]
-    bad += [f"{entry.fault}: {problem}" for entry in findings for problem in entry.problems]
+    bad += [f"{entry.fault}: {problem}" for entry in results for problem in entry.problems]
     for line in bad:
         console.print(line, markup=False, soft_wrap=True)
     if bad:
-        raise VelapError(f"{len(bad)} problems in {len(reports) + len(findings)} faults; expected none. They stand above.")
-    console.print(f"{len(findings)} faults and {sum(entry.kills for entry in reports)} kills: all as they should be")
+        raise VelapError(f"{len(bad)} problems in {len(reports) + len(results)} faults; expected none. They stand above.")
+    console.print(f"{len(results)} faults and {sum(entry.kills for entry in reports)} kills: all as they should be")
 
 
-def _kill(root: Path, kills: int, rng: np.random.Generator, view: View) -> list[KillReport]:
+def _kill(root: Path, kills: int, rng: np.random.Generator, view: ProgressBar) -> list[KillReport]:
     """Kill collecting and training; leaves an intact dataset and run in `root/base`."""
     collect, train = ("collect", "SpiralMaze", "--workers"), ("train", "SpiralMaze", "--out", "run")
-    victim = Victim((*collect, "2"), (*collect, "1"), None, 8)
+    victim = Victim(arguments=(*collect, "2"), resume=(*collect, "1"), datasets=None, fsyncs=8)
     reports = [kill_and_resume(victim, root / "collect", kills, rng,
                                lambda done: view.show(done, title="killed collecting"))]
     shutil.copytree(root / "collect" / "whole" / "datasets", root / "base" / "datasets")
-    victim = Victim(train, (*train, "--resume"), root / "base" / "datasets", 24)
+    victim = Victim(arguments=train, resume=(*train, "--resume"), datasets=root / "base" / "datasets", fsyncs=24)
     reports.append(kill_and_resume(victim, root / "train", kills, rng,
                                    lambda done: view.show(kills + done, title="killed training")))
     shutil.copytree(root / "train" / "whole" / "run", root / "base" / "run")
     return reports
 
 
-def _spoil(root: Path, done: int, view: View) -> list[Finding]:
+def _spoil(root: Path, done: int, view: ProgressBar) -> list[CaseResult]:
     """All other cases on copies of `root/base`; `done` of the view's total went before."""
-    findings = []
+    results = []
     for case in CASES:
-        findings.append(check(case, root / "base", root / "case", run_alone))
-        view.show(done + len(findings), title=case.fault)
+        results.append(check(case, root / "base", root / "case", run_alone))
+        view.show(done + len(results), title=case.fault)
     for disk_case in DISK_CASES:
-        findings.append(check_disk(disk_case, root / "base", root / "case", run_alone))
-        view.show(done + len(findings), title=disk_case.fault)
-    return findings
+        results.append(check_disk(disk_case, root / "base", root / "case", run_alone))
+        view.show(done + len(results), title=disk_case.fault)
+    return results
 
 
-def report(command: str, reports: Sequence[KillReport], findings: Sequence[Finding]) -> str:
+def report(command: str, reports: Sequence[KillReport], results: Sequence[CaseResult]) -> str:
     """The document, in Markdown."""
     kills = "\n".join(f"| `{entry.command}` | {entry.kills} | {_verdict(entry.problems)} |" for entry in reports)
     faults = "\n".join(f"| {entry.fault} | `{entry.command}` | {_cell(entry.message)} | {entry.code} | "
-                       f"{_verdict(entry.problems)} |" for entry in findings)
+                       f"{_verdict(entry.problems)} |" for entry in results)
     train = ", ".join(f"{name} {SMALL['train'][name]}" for name in ("joint_steps", "latent_steps", "checkpoint_every"))
     return f"""# Faults
 

@@ -50,12 +50,12 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
 def evaluate_with_progress(what: Evaluation, seeds: range, records: Path, *, fresh: bool = False, batch: int = 10,
                            video: bool = False) -> None:
     """Evaluate, show how far it is, and print the summary."""
-    from velap.evaluation.console import EpisodeView
+    from velap.evaluation.console import EpisodeBar
     from velap.evaluation.evaluate import evaluate, load_player
     from velap.evaluation.summary import summarise, summary_text
 
     player = load_player(what)
-    with EpisodeView(OUT, f"{what.method} on {what.task}", len(seeds)) as view:
+    with EpisodeBar(OUT, f"{what.method} on {what.task}", len(seeds)) as view:
         results = evaluate(what, seeds, records, batch=batch, fresh=fresh, on_record=view, player=player)
     say(summary_text(summarise(results)))
     say(f"records {player.key.path(records)}")

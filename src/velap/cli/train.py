@@ -25,11 +25,11 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
         overwrite: Replace a dataset of that id.
     """
     from velap.data.collection import collect as run
-    from velap.evaluation.console import View
+    from velap.evaluation.console import ProgressBar
     from velap.tasks import get_task
 
     recipe = get_task(task).recipe
-    with View(OUT, f"collecting {task}", recipe.contexts * recipe.trajectories) as view:
+    with ProgressBar(OUT, f"collecting {task}", recipe.contexts * recipe.trajectories) as view:
         result = run(task, seed, workers, dataset_id, overwrite, progress=lambda done, _: view.show(done), command=command())
     for text in result.notes:
         note(text)
@@ -78,7 +78,7 @@ def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None
                         base: Path | None = None, reading: Mapping[str, Any] | None = None) -> Path:
     """Train and show how far it is; returns the joint checkpoint."""
     from velap import api
-    from velap.evaluation.console import TrainView
+    from velap.evaluation.console import TrainingBar
     from velap.methods.base import get_method
     from velap.methods.heads import head_path
     from velap.methods.learning import read_result
@@ -89,7 +89,7 @@ def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None
     directory = out or api.run_dir(api.task_of(source), preset, seed)
     if kind.learns and not (directory / MODEL).exists():
         note(f"no joint checkpoint in {directory}; it is trained first")
-    with TrainView(OUT) as view:
+    with TrainingBar(OUT) as view:
         checkpoint = api.train(source, preset, seed, out, method=method, image_key=image_key, device=device, resume=resume,
                                changes=changes, base=base, command=command(), on_progress=view, **(reading or {}))
     say(f"checkpoint {checkpoint}")

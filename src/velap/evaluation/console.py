@@ -17,7 +17,7 @@ LINE_EVERY = 15.0
 """Seconds between progress lines where the output is no terminal [s]."""
 
 
-class View:
+class ProgressBar:
     """A progress bar with a text beside it; where the output is no terminal, a line now and then and one at the end."""
 
     def __init__(self, console: Console, title: str, total: int) -> None:
@@ -57,7 +57,7 @@ class View:
         self._bar.stop()
 
 
-class TrainView(View):
+class TrainingBar(ProgressBar):
     """Steps and losses of training runs, one after the other; each report brings its total."""
 
     def __init__(self, console: Console) -> None:
@@ -69,7 +69,7 @@ class TrainView(View):
         self.show(progress.step, losses, f"training, {progress.phase}", progress.total)
 
 
-class EpisodeView(View):
+class EpisodeBar(ProgressBar):
     """Counts episodes and successes."""
 
     def __init__(self, console: Console, title: str, total: int) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from velap.errors import CheckpointError
-from velap.evaluation.console import EpisodeView
+from velap.evaluation.console import EpisodeBar
 from velap.evaluation.evaluate import Evaluation, Player, load_player, to_record
 from velap.evaluation.records import Record
 from velap.evaluation.rollout import Episode
@@ -46,7 +46,8 @@ class FirstPlan:
         if self._kept is None:
             return False
         frame, plan, row = self._kept
-        plan_figure(path, frame, plan, row, latent_map, f"VELAP's first plan of episode {self._seed}")
+        plan_figure(path, frame=frame, plan=plan, row=row, latent_map=latent_map,
+                    title=f"VELAP's first plan of episode {self._seed}")
         return True
 
 
@@ -82,7 +83,7 @@ def _play(console: Console, player: Player, episodes: int, video: Path, latent_m
           first_plan: FirstPlan) -> list[Record]:
     """Run and film the episodes, showing each as it ends."""
     records: list[Record] = []
-    with EpisodeView(console, "demo", episodes) as view, VideoRecorder(video, episodes, latent_map) as recorder:
+    with EpisodeBar(console, "demo", episodes) as view, VideoRecorder(video, episodes, latent_map) as recorder:
 
         def observe(row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
             first_plan(row, seed, env, agent, outcome)

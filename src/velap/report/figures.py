@@ -31,7 +31,7 @@ SMALLEST_SHOWN = 1e-3
 """Lower end of the logarithmic colours [Q-value]. ours: γ^169."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LatentMap:
     """Latents whose robot positions are known: what a latent that a planner dreamt up would look like in the world."""
 
@@ -58,7 +58,7 @@ def can_probe(env: gym.Env[Any, Any]) -> bool:
 
 
 @torch.inference_mode()
-def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_stack: int, rng: np.random.Generator,
+def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, *, frame_stack: int, rng: np.random.Generator,
           count: int = PROBES, seed: int = 0) -> LatentMap:
     """Encode `count` states at uniform free positions, each after a few steps of one random action, as in the data.
 
@@ -83,8 +83,12 @@ def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_s
     batches = zip(torch.from_numpy(everything).split(256), commands.split(256), strict=True)
     latents = torch.cat([model.encode(batch.to(device), before) for batch, before in batches])
     values = model.value(latents).float().cpu().numpy()
-    return LatentMap(latents.float().cpu().numpy(), np.stack(positions), values, world.extent,
-                     everything[:, -1])
+    return LatentMap(
+        latents=latents.float().cpu().numpy(),
+        positions=np.stack(positions),
+        values=values,
+        extent=world.extent,
+        frames=everything[:, -1])
 
 
 def to_pixels(positions: NDArray[np.float64], extent: tuple[float, float, float, float], size: int) -> NDArray[np.float64]:
@@ -94,7 +98,7 @@ def to_pixels(positions: NDArray[np.float64], extent: tuple[float, float, float,
     return np.stack([(x - left) / (right - left) * size, (top - y) / (top - bottom) * size], -1)
 
 
-def plan_figure(path: Path, frame: NDArray[np.uint8], plan: Plan, row: int, latent_map: LatentMap, title: str) -> None:
+def plan_figure(path: Path, *, frame: NDArray[np.uint8], plan: Plan, row: int, latent_map: LatentMap, title: str) -> None:
     """Draw the plan of one row into a PNG.
 
     Args:

@@ -132,7 +132,8 @@ def latent_map_of(player: Player) -> LatentMap | None:
         if player.model is None or not can_probe(env):
             return None
         reader = player.frames_of(env)
-        return probe(player.model, env, reader, player.config.model.frame_stack, np.random.default_rng(0))
+        return probe(player.model, env, reader, frame_stack=player.config.model.frame_stack,
+                     rng=np.random.default_rng(0))
     finally:
         env.close()
 

@@ -22,21 +22,21 @@ from velap.report.diagnose import figures
 from velap.report.diagnose.failures import Failures, watch
 from velap.report.diagnose.model import (
     ActionValues,
-    Album,
-    Pairs,
+    RealStates,
     Recorded,
     RolloutError,
+    StatePairs,
     ValueCurve,
     action_values,
-    album_of,
     encode_states,
     open_recorded,
     other_pairs,
+    real_states_of,
     rewarded_curves,
     rollout_error,
 )
 from velap.report.diagnose.plans import Starts, Trees, diagnose_trees
-from velap.report.diagnose.text import findings, page
+from velap.report.diagnose.text import checks, page
 from velap.report.diagnose.world import Scene, expert_curves, first_states, has_layout, look_at_scene, scenery
 from velap.report.figures import can_probe
 from velap.runs import write_atomic
@@ -84,7 +84,7 @@ class Request:
     command: str = "velap diagnose"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """All results; text and pictures read it."""
 
@@ -100,7 +100,7 @@ class Diagnosis:
     simulated: int
     """Simulated steps of an expansion, `planner.n_sim` [steps]."""
     rollout: RolloutError
-    pairs: tuple[Pairs, ...]
+    pairs: tuple[StatePairs, ...]
     curves: tuple[ValueCurve, ...]
     actions: ActionValues
     scenes: tuple[Scene, ...]
@@ -175,7 +175,7 @@ def run_diagnose(console: Console, request: Request) -> Diagnosis:
     with console.status("drawing"):
         _draw(diagnosis, out)
     write_atomic(out / PAGE, page(diagnosis).encode())
-    for each in findings(diagnosis):
+    for each in checks(diagnosis):
         console.print(f"{each.mark:>4}  {each.title}: {each.numbers}", markup=False, soft_wrap=True)
     console.print(f"report {out / PAGE}, {time.monotonic() - began:.0f} s", markup=False, soft_wrap=True)
     return diagnosis
@@ -189,12 +189,13 @@ def _measure(console: Console, request: Request, subject: _Subject, model: Laten
     with console.status("rollouts and distances on recorded episodes"):
         rollout = rollout_error(horizons(model, recorded.sampler, recorded.spans, range(1, min(LONGEST, longest) + 1), None))
         pairs = other_pairs(model, recorded, config.train.group_reach, rng)
-        album, held_out = album_of(model, recorded, rng), encode_states(model, recorded.sampler, recorded.rows)
+        real_states, held_out = real_states_of(model, recorded, rng), encode_states(model, recorded.sampler, recorded.rows)
     world = _World() if player is None else _look_at_world(console, request, model, player)
     starts = world.starts or _recorded_starts(recorded)
     with console.status("plans"):
         seeds = range(request.first_seed, request.first_seed + len(starts.labels))
-        trees = diagnose_trees(model, config, starts, seeds, album, world.scenery, held_out, rollout.one_step)
+        trees = diagnose_trees(model, config, starts, seeds=seeds, real_states=real_states, scenery=world.scenery,
+                               held_out=held_out, one_step=rollout.one_step)
     curves = world.curves or tuple(rewarded_curves(model, recorded))
     failures = None
     if player is not None:
@@ -202,10 +203,21 @@ def _measure(console: Console, request: Request, subject: _Subject, model: Laten
             failures = watch(player, range(request.first_seed, request.first_seed + request.episodes), recorded.fastest)
     pictures = ["model.png", *(["values.png"] if curves else []), *(["scenes.png"] if world.scenes else []), "plan.png"]
     return Diagnosis(
-        subject.name, request.command, _origin(subject, recorded, config), _left_out(world, player),
-        model.discount, config.controller.waypoint_exponent, config.planner.n_sim, rollout, tuple(pairs), curves,
-        action_values(model, recorded, held_out), world.scenes, trees, failures,
-        (*pictures, *(["failure.png"] if failures is not None else [])))
+        subject=subject.name,
+        command=request.command,
+        origin=_origin(subject, recorded, config),
+        left_out=_left_out(world, player),
+        discount=model.discount,
+        arrived_steps=config.controller.waypoint_exponent,
+        simulated=config.planner.n_sim,
+        rollout=rollout,
+        pairs=tuple(pairs),
+        curves=curves,
+        actions=action_values(model, recorded, held_out),
+        scenes=world.scenes,
+        trees=trees,
+        failures=failures,
+        pictures=(*pictures, *(["failure.png"] if failures is not None else [])))
 
 
 class _World(NamedTuple):
@@ -214,7 +226,7 @@ class _World(NamedTuple):
     starts: Starts | None = None
     curves: tuple[ValueCurve, ...] = ()
     scenes: tuple[Scene, ...] = ()
-    scenery: Album | None = None
+    scenery: RealStates | None = None
 
 
 def _look_at_world(console: Console, request: Request, model: LatentModel, player: Player) -> _World:

@@ -19,7 +19,7 @@ from velap.evaluation.evaluate import BATCH, Player
 from velap.evaluation.rollout import Episode
 from velap.methods.base import Agent
 from velap.methods.velap import VelapAgent
-from velap.report.diagnose.plans import Strip
+from velap.report.diagnose.plans import FilmStrip
 
 LEFT_START = 5.0
 """An episode left its start once the agent is farther from it than this many of its fastest steps [steps]. ours."""
@@ -76,8 +76,8 @@ class Trace:
     """[steps]"""
 
 
-@dataclass(frozen=True)
-class Outcome:
+@dataclass(frozen=True, kw_only=True)
+class JudgedEpisode:
     """One episode, judged."""
 
     seed: int
@@ -99,8 +99,8 @@ class Outcome:
 class Failures:
     """All episodes."""
 
-    outcomes: tuple[Outcome, ...]
-    strip: Strip
+    outcomes: tuple[JudgedEpisode, ...]
+    strip: FilmStrip
     """One episode that failed, or the longest where none did."""
 
     @property
@@ -141,13 +141,17 @@ def fastest_step(traces: Sequence[Trace]) -> float:
     return float(np.concatenate(ways).max()) if ways else 0.0
 
 
-def judge(traces: Sequence[Trace], fastest: float | None) -> tuple[Outcome, ...]:
+def judge(traces: Sequence[Trace], fastest: float | None) -> tuple[JudgedEpisode, ...]:
     """Every episode, in the order of the seeds; `fastest` is the longest recorded step, where it is known [m/step]."""
     fastest = max(fastest_step(traces), fastest or 0.0)
-    return tuple(Outcome(
-        trace.seed, classify(trace, fastest), trace.steps, _farthest(trace) if trace.positions else None,
-        max(trace.values, default=float("nan")), float(np.mean(trace.near_goal)) if trace.near_goal else 0.0,
-        min(trace.goal_steps, default=None)) for trace in sorted(traces, key=lambda trace: trace.seed))
+    return tuple(JudgedEpisode(
+        seed=trace.seed,
+        kind=classify(trace, fastest),
+        steps=trace.steps,
+        farthest=_farthest(trace) if trace.positions else None,
+        best_value=max(trace.values, default=float("nan")),
+        by_global=float(np.mean(trace.near_goal)) if trace.near_goal else 0.0,
+        goal_steps=min(trace.goal_steps, default=None)) for trace in sorted(traces, key=lambda trace: trace.seed))
 
 
 class Tracer:
@@ -180,7 +184,7 @@ class Tracer:
             trace.shots.append((step, np.asarray(env.render(), np.uint8)))
 
 
-def failure_strip(trace: Trace, kind: str) -> Strip:
+def failure_strip(trace: Trace, kind: str) -> FilmStrip:
     """At most `SHOTS` frames of an episode, its first and last ones among them."""
     picked = np.unique(np.linspace(0, len(trace.shots) - 1, min(SHOTS, len(trace.shots))).astype(int))
     frames, captions = [], []
@@ -190,7 +194,7 @@ def failure_strip(trace: Trace, kind: str) -> Strip:
         value = f"$Q^g$ {trace.values[step]:.2g}" if step < len(trace.values) else "end"
         by_global = ", $\\pi^g$" if step < len(trace.near_goal) and trace.near_goal[step] else ""
         captions.append(f"step {step}\n{value}{by_global}")
-    return Strip(f"Episode {trace.seed}: {kind}", np.stack(frames), tuple(captions))
+    return FilmStrip(title=f"Episode {trace.seed}: {kind}", frames=np.stack(frames), captions=tuple(captions))
 
 
 def watch(player: Player, seeds: Sequence[int], fastest: float | None) -> Failures:

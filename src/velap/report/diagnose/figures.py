@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from velap.report.diagnose.model import Pairs, RolloutError, ValueCurve
-from velap.report.diagnose.plans import Strip
+from velap.report.diagnose.model import RolloutError, StatePairs, ValueCurve
+from velap.report.diagnose.plans import FilmStrip
 from velap.report.diagnose.world import NEAR, Scene
 from velap.report.figures import SMALLEST_SHOWN, new_figure, save_figure
 
@@ -25,7 +25,7 @@ SHOWN_PAIRS = 3000
 """Points of a scatter plot at most."""
 
 
-def model_figure(path: Path, rollout: RolloutError, pairs: Sequence[Pairs]) -> None:
+def model_figure(path: Path, rollout: RolloutError, pairs: Sequence[StatePairs]) -> None:
     """Rollout error against displacement, Q^l against true steps, Q^l between trajectories."""
     figure = new_figure(15, 4.6, "Model on recorded episodes (medians and quartiles)")
     in_rollout, in_local, in_pairs = figure.subplots(1, 3)
@@ -87,7 +87,7 @@ def scenes_figure(path: Path, scenes: Sequence[Scene], seed: int = 0) -> None:
     save_figure(figure, path)
 
 
-def strip_figure(path: Path, strip: Strip) -> None:
+def strip_figure(path: Path, strip: FilmStrip) -> None:
     """Frames in reading order with their captions below."""
     picked = np.unique(np.linspace(0, len(strip.frames) - 1, min(MOST_FRAMES, len(strip.frames))).astype(int))
     rows = -(-len(picked) // COLUMNS)

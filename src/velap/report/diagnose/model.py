@@ -1,6 +1,6 @@
 """What `velap diagnose` measures on recorded episodes: dynamics, distances by Q^l and values by Q^g; no environment.
 
-F frames of the dataset, S pairs of states, T transitions of an episode, D latent dimensions, P frames of an album,
+F frames of the dataset, S pairs of states, T transitions of an episode, D latent dimensions, P real states,
 N stacked frames, H x W pixels.
 """
 
@@ -30,7 +30,7 @@ from velap.training.loop import holdout_episodes
 
 PAIRS = 1000
 """Pairs of states of other trajectories, of each kind. ours."""
-ALBUM = 4000
+REAL_STATES = 4000
 """Frames of the dataset that a latent is compared with. ours: a few seconds of encoding."""
 FEW = 16
 """Episodes that are looked at where none was held out. ours, as `holdout_episodes`."""
@@ -47,7 +47,7 @@ APART = 2.0
 """Two states are apart where the agent needs more than this times the steps that count as arrived. ours."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Recorded:
     """A dataset, and the episodes of it that are looked at."""
 
@@ -94,8 +94,12 @@ def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, co
     sampler = WindowSampler(store, config.train, config.model.frame_stack, device, kept)
     positions = load_positions(dataset_id)
     known = positions is not None and len(positions) == len(store.frames)
-    return Recorded(store, sampler, kept if len(kept) else np.arange(min(FEW, store.n_episodes)), held_out,
-                    positions if known else None)
+    return Recorded(
+        store=store,
+        sampler=sampler,
+        episodes=kept if len(kept) else np.arange(min(FEW, store.n_episodes)),
+        held_out=held_out,
+        positions=positions if known else None)
 
 
 @torch.inference_mode()
@@ -111,7 +115,7 @@ def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) 
     return float(spearmanr(first, second).statistic)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RolloutError:
     """How far h leads from the truth, against how far the truth moves: medians and quartiles over S pairs."""
 
@@ -138,13 +142,16 @@ def rollout_error(horizons: Sequence[Horizon]) -> RolloutError:
     def quartiles(values: Sequence[Tensor], unit: float) -> NDArray[np.float64]:
         return np.stack([np.quantile(each.double().cpu().numpy() / unit, (0.25, 0.5, 0.75)) for each in values], 1)
 
-    return RolloutError(np.array([each.length for each in horizons]), quartiles([each.error for each in horizons], one_step),
-                        quartiles([each.moved for each in horizons], one_step),
-                        quartiles([each.local_steps for each in horizons], 1.0), one_step)
+    return RolloutError(
+        lengths=np.array([each.length for each in horizons]),
+        error=quartiles([each.error for each in horizons], one_step),
+        moved=quartiles([each.moved for each in horizons], one_step),
+        local_steps=quartiles([each.local_steps for each in horizons], 1.0),
+        one_step=one_step)
 
 
-@dataclass(frozen=True)
-class Pairs:
+@dataclass(frozen=True, kw_only=True)
+class StatePairs:
     """States of other trajectories as Q^l sees them from states of the episodes that are looked at."""
 
     name: str
@@ -166,7 +173,7 @@ class Pairs:
 
 
 def other_pairs(model: LatentModel, recorded: Recorded, reach: int, rng: np.random.Generator,
-                count: int = PAIRS) -> list[Pairs]:
+                count: int = PAIRS) -> list[StatePairs]:
     """Pairs with episodes recorded at most `reach` [episodes] before or after, which tend to share a scene, and with the
     others."""
     store = recorded.store
@@ -184,8 +191,9 @@ def other_pairs(model: LatentModel, recorded: Recorded, reach: int, rng: np.rand
         if (chosen < 0).any():
             continue
         goal = store.episode_start[chosen] + rng.integers(0, store.episode_length[chosen] + 1)
-        found.append(Pairs(name, local_steps(model, latents, encode_states(model, recorded.sampler, goal)),
-                           _least_steps(recorded, start, goal)))
+        goals = encode_states(model, recorded.sampler, goal)
+        found.append(StatePairs(name=name, local_steps=local_steps(model, latents, goals),
+                                least_steps=_least_steps(recorded, start, goal)))
     return found
 
 
@@ -249,7 +257,7 @@ def rewarded_curves(model: LatentModel, recorded: Recorded, count: int = REWARDE
     return curves
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ActionValues:
     """What Q^g promises of recorded actions, against what has come of them some steps later; S transitions.
 
@@ -281,11 +289,11 @@ def action_values(model: LatentModel, recorded: Recorded, latents: Tensor) -> Ac
     lengths = [last - first + 1 for first, last in recorded.spans]
     begins = np.cumsum([0, *lengths[:-1]])
     now = np.concatenate([begin + np.arange(max(length - LED, 0)) for begin, length in zip(begins, lengths, strict=True)])
-    return ActionValues(values[now], values[now] - taken[now], values[now] - values[now + LED])
+    return ActionValues(away=values[now], promised=values[now] - taken[now], gained=values[now] - values[now + LED])
 
 
-@dataclass(frozen=True)
-class Album:
+@dataclass(frozen=True, kw_only=True)
+class RealStates:
     """Real states: what they look like and where they are in the latent space."""
 
     source: str
@@ -306,10 +314,13 @@ class Album:
         return float(distances.fill_diagonal_(torch.inf).amin(1).mean())
 
 
-def album_of(model: LatentModel, recorded: Recorded, rng: np.random.Generator, size: int = ALBUM) -> Album:
+def real_states_of(model: LatentModel, recorded: Recorded, rng: np.random.Generator, size: int = REAL_STATES) -> RealStates:
     """States of the dataset, drawn uniformly from the episodes that are not looked at where there are others."""
     rows = np.setdiff1d(np.arange(len(recorded.store.frames)), recorded.rows if recorded.held_out else [])
     if len(rows) == 0:
         rows = recorded.rows
     rows = np.sort(rng.choice(rows, min(size, len(rows)), replace=False))
-    return Album("the dataset", encode_states(model, recorded.sampler, rows), recorded.store.frames[rows])
+    return RealStates(
+        source="the dataset",
+        latents=encode_states(model, recorded.sampler, rows),
+        frames=recorded.store.frames[rows])

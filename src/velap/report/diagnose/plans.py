@@ -16,7 +16,7 @@ from torch import Tensor
 from velap.config import Config
 from velap.models.horizon import q_from_steps
 from velap.models.velap import LatentModel
-from velap.report.diagnose.model import Album
+from velap.report.diagnose.model import RealStates
 from velap.search.est import plan
 from velap.search.types import Plan, SearchFns
 
@@ -31,7 +31,7 @@ class Starts:
     """[B, N, H, W, 3]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TreeNumbers:
     """One plan in numbers."""
 
@@ -49,11 +49,11 @@ class TreeNumbers:
     cost: float
     """[steps]"""
     distance: float
-    """Mean distance of the nodes to the nearest state of the album [one-step lengths]."""
+    """Mean distance of the nodes to the nearest real state [one-step lengths]."""
 
 
-@dataclass(frozen=True)
-class Strip:
+@dataclass(frozen=True, kw_only=True)
+class FilmStrip:
     """A chain of latents as the real frames nearest to them."""
 
     title: str
@@ -63,13 +63,13 @@ class Strip:
     """[L]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Trees:
     """Plans from all starts."""
 
     numbers: tuple[TreeNumbers, ...]
     held_out_distance: float
-    """Mean distance of held-out states to the album: what a real state has [one-step lengths]."""
+    """Mean distance of held-out states to the others: what a real state has [one-step lengths]."""
     scene_distance: float | None
     """Mean distance of the first tree's nodes to real states of their own scene [one-step lengths]; None where these cannot
     be had."""
@@ -77,7 +77,7 @@ class Trees:
     """Mean distance of those real states to the nearest other one [one-step lengths]."""
     goal_value: float
     """τ_goal [Q-value]."""
-    strip: Strip
+    strip: FilmStrip
     """The plan from the first start."""
 
 
@@ -90,7 +90,7 @@ def grow(model: LatentModel, config: Config, starts: Starts, seeds: Sequence[int
     return latents, plan(fns, latents, config.planner, [torch.Generator().manual_seed(seed) for seed in seeds])
 
 
-def tree_numbers(starts: Starts, result: Plan, album: Album, one_step: float) -> tuple[TreeNumbers, ...]:
+def tree_numbers(starts: Starts, result: Plan, real_states: RealStates, one_step: float) -> tuple[TreeNumbers, ...]:
     """One entry a start."""
     found = []
     for row, label in enumerate(starts.labels):
@@ -98,29 +98,29 @@ def tree_numbers(starts: Starts, result: Plan, album: Album, one_step: float) ->
         values, latents = result.tree.goal_values[row, :size], result.tree.latents[row, :size]
         rejected = {name: int(count[row]) for name, count in result.rejections._asdict().items()}
         found.append(TreeNumbers(
-            label, size, rejected, float(values[0]), float(values.max()),
-            bool(result.reached_goal[row]), int(result.length[row]) - 1, float(result.cost[row]),
-            float(album.nearest(latents)[1].mean()) / one_step))
+            start=label, nodes=size, rejected=rejected, start_value=float(values[0]), best_value=float(values.max()),
+            reached_goal=bool(result.reached_goal[row]), waypoints=int(result.length[row]) - 1, cost=float(result.cost[row]),
+            distance=float(real_states.nearest(latents)[1].mean()) / one_step))
     return tuple(found)
 
 
-def plan_strip(starts: Starts, result: Plan, album: Album, one_step: float, row: int = 0) -> Strip:
+def plan_strip(starts: Starts, result: Plan, real_states: RealStates, one_step: float, row: int = 0) -> FilmStrip:
     """The chosen path from one start: the start frame itself, then what lies nearest to each waypoint."""
     length = int(result.length[row])
     nodes = result.nodes[row, :length]
     values = result.tree.goal_values[row, nodes].double().cpu().numpy()
-    frames, distances = album.nearest(result.waypoints[row, :length])
+    frames, distances = real_states.nearest(result.waypoints[row, :length])
     frames = frames.copy()
     frames[0] = starts.stacks[row, -1]
     captions = [f"start\n$Q^g$ {values[0]:.2g}"]
     captions += [f"{number}: {distance / one_step:.1f} off\n$Q^g$ {value:.2g}"
                  for number, (distance, value) in enumerate(zip(distances[1:], values[1:], strict=True), 1)]
-    return Strip(f"Plan from {starts.labels[row]}: nearest frames of {album.source} and how far off they are "
-                 "[one-step lengths]", frames, tuple(captions))
+    return FilmStrip(title=f"Plan from {starts.labels[row]}: nearest frames of {real_states.source}, how far off they are "
+                 "[one-step lengths]", frames=frames, captions=tuple(captions))
 
 
-def diagnose_trees(model: LatentModel, config: Config, starts: Starts, seeds: Sequence[int], album: Album,
-                   scenery: Album | None, held_out: Tensor, one_step: float) -> Trees:
+def diagnose_trees(model: LatentModel, config: Config, starts: Starts, *, seeds: Sequence[int], real_states: RealStates,
+                   scenery: RealStates | None, held_out: Tensor, one_step: float) -> Trees:
     """Plan from all starts and compare the nodes with real states.
 
     Args:
@@ -128,9 +128,9 @@ def diagnose_trees(model: LatentModel, config: Config, starts: Starts, seeds: Se
         config: its planner.
         starts: where from.
         seeds: [B] randomness of each plan.
-        album: states of the dataset.
+        real_states: states of the dataset.
         scenery: states of the first start's own scene, where they can be had; the film strip then shows these.
-        held_out: [R, D] states that were recorded and are not in the album.
+        held_out: [R, D] states that were recorded and are not among `real_states`.
         one_step: mean distance of subsequent encodings [latent distance].
     """
     _, result = grow(model, config, starts, seeds)
@@ -138,7 +138,10 @@ def diagnose_trees(model: LatentModel, config: Config, starts: Starts, seeds: Se
     if scenery is not None:
         first = result.tree.latents[0, : int(result.tree.size[0])]
         scene_distance, spacing = float(scenery.nearest(first)[1].mean()) / one_step, scenery.spacing() / one_step
-    return Trees(tree_numbers(starts, result, album, one_step), float(album.nearest(held_out)[1].mean()) / one_step,
-                 scene_distance, spacing,
-                 q_from_steps(config.planner.goal_exponent, model.discount),
-                 plan_strip(starts, result, scenery or album, one_step))
+    return Trees(
+        numbers=tree_numbers(starts, result, real_states, one_step),
+        held_out_distance=float(real_states.nearest(held_out)[1].mean()) / one_step,
+        scene_distance=scene_distance,
+        scene_spacing=spacing,
+        goal_value=q_from_steps(config.planner.goal_exponent, model.discount),
+        strip=plan_strip(starts, result, scenery or real_states, one_step))

@@ -14,7 +14,7 @@ import numpy as np
 
 from velap.models.horizon import steps_from_q
 from velap.report.diagnose.failures import CLASSES, REMEDIES, Failures
-from velap.report.diagnose.model import APART, LAST, LED, ActionValues, Pairs, RolloutError, ValueCurve
+from velap.report.diagnose.model import APART, LAST, LED, ActionValues, RolloutError, StatePairs, ValueCurve
 from velap.report.diagnose.plans import TreeNumbers, Trees
 from velap.report.diagnose.world import NEAR, Scene
 from velap.search.types import Rejections
@@ -38,8 +38,8 @@ SUPPORT_FACTOR = 1.5
 """Nodes of a tree are at most this factor farther from the data than held-out states are."""
 
 
-@dataclass(frozen=True)
-class Finding:
+@dataclass(frozen=True, kw_only=True)
+class Check:
     """One thing that was measured."""
 
     title: str
@@ -55,7 +55,7 @@ class Finding:
         return {True: "ok", False: "LOOK", None: "info"}[self.good]
 
 
-def findings(diagnosis: Diagnosis) -> list[Finding]:
+def checks(diagnosis: Diagnosis) -> list[Check]:
     """Everything that was measured, in the order in which a fault spreads: model, distances, values, plans, episodes."""
     limit = diagnosis.arrived_steps
     found = [*_of_rollouts(diagnosis.rollout, diagnosis.simulated), *_of_pairs(diagnosis.pairs, limit)]
@@ -66,106 +66,123 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     return found + ([_of_failures(diagnosis.failures)] if diagnosis.failures is not None else [])
 
 
-def _of_rollouts(rollout: RolloutError, simulated: int) -> Iterator[Finding]:
+def _of_rollouts(rollout: RolloutError, simulated: int) -> Iterator[Check]:
     """h and Q^l within trajectories."""
     at = rollout.at(simulated)
     error, moved, length = rollout.error[1, at], rollout.moved[1, at], rollout.lengths[at]
-    yield Finding(
-        "Dynamics h", f"after {length} steps a rollout is {error:.2f} one-step lengths off; the state has moved {moved:.2f}",
-        bool(error <= ERROR_SHARE * moved), f"an error of at most {ERROR_SHARE:.0%} of the displacement",
-        "train longer (train.joint_steps, train.latent_steps), simulate fewer steps a node (planner.n_sim), or check "
-        "whether model.frame_stack frames show the whole state")
+    yield Check(
+        title="Dynamics h",
+        numbers=f"after {length} steps a rollout is {error:.2f} one-step lengths off; the state has moved {moved:.2f}",
+        good=bool(error <= ERROR_SHARE * moved),
+        expected=f"an error of at most {ERROR_SHARE:.0%} of the displacement",
+        advice="train longer (train.joint_steps, train.latent_steps), simulate fewer steps a node (planner.n_sim), or "
+               "check whether model.frame_stack frames show the whole state")
     steps = rollout.local_steps[1, at]
-    yield Finding(
-        "Q^l within a trajectory", f"states {length} steps apart are {steps:.1f} steps apart by Q^l (median)",
-        bool(length / LOCAL_FACTOR / LOCAL_FACTOR <= steps <= length * LOCAL_FACTOR),
-        f"at most about {length}, since a random walk takes detours, and not near 0",
-        "near 0: distances have collapsed, raise train.c1; far above: train longer")
+    yield Check(
+        title="Q^l within a trajectory", numbers=f"states {length} steps apart are {steps:.1f} steps apart by Q^l (median)",
+        good=bool(length / LOCAL_FACTOR / LOCAL_FACTOR <= steps <= length * LOCAL_FACTOR),
+        expected=f"at most about {length}, since a random walk takes detours, and not near 0",
+        advice="near 0: distances have collapsed, raise train.c1; far above: train longer")
 
 
-def _of_pairs(pairs: Sequence[Pairs], limit: float) -> Iterator[Finding]:
+def _of_pairs(pairs: Sequence[StatePairs], limit: float) -> Iterator[Check]:
     """Q^l between trajectories."""
     for each in pairs:
         aliased, share = each.aliased(limit), each.arrived(limit)
         known = "" if aliased is None else (f", {aliased:.1%} of those whose agent is more than {APART * limit:.0f} steps "
                                             "apart")
-        yield Finding(
-            f"Q^l, {each.name}", f"median {np.median(each.local_steps):.1f} steps; {share:.1%} of the pairs count as "
-            f"arrived (at most {limit:.0f} steps){known}", (share if aliased is None else aliased) <= ALIASED,
-            f"far more steps than within a trajectory, at most {ALIASED:.0%} that count as arrived",
-            "aliased states make short cuts through walls: draw windows together (train.group_windows), raise "
-            "model.frame_stack, or lower controller.waypoint_exponent")
+        yield Check(
+            title=f"Q^l, {each.name}",
+            numbers=f"median {np.median(each.local_steps):.1f} steps; {share:.1%} of the pairs count as arrived (at most "
+                    f"{limit:.0f} steps){known}",
+            good=(share if aliased is None else aliased) <= ALIASED,
+            expected=f"far more steps than within a trajectory, at most {ALIASED:.0%} that count as arrived",
+            advice="aliased states make short cuts through walls: draw windows together (train.group_windows), raise "
+                   "model.frame_stack, or lower controller.waypoint_exponent")
 
 
-def _of_scenes(scenes: Sequence[Scene], limit: float) -> Iterator[Finding]:
+def _of_scenes(scenes: Sequence[Scene], limit: float) -> Iterator[Check]:
     """True distances in mazes."""
     local, near, value = ([getattr(scene, name) for scene in scenes] for name in ("local_rho", "near_rho", "value_rho"))
     aliased = max(scene.aliased(limit, APART * limit) or 0.0 for scene in scenes)
-    yield Finding(
-        "Q^l against shortest ways in test scenes", f"rho {_numbers(near)} up to {NEAR:.0f} steps, {_numbers(local)} in "
-        f"all; {aliased:.1%} of the pairs more than {APART * limit:.0f} steps apart count as arrived",
-        min(near) >= RHO and aliased <= ALIASED, f"rho of {RHO} and more up to {NEAR:.0f} steps, at most {ALIASED:.0%}; far "
-        "pairs are beyond what Q^l was taught",
-        "where recorded episodes above are fine and these are not, the encoder does not generalise to new scenes: more "
-        "contexts in the data, or train.group_windows")
-    yield Finding(
-        "Q^g against the shortest way to the goal", f"rho {_numbers(value)}", None,
-        f"high near the goal; {RHO} and more over a whole maze is a luxury, the tree does without", "see Q^g along episodes")
+    yield Check(
+        title="Q^l against shortest ways in test scenes",
+        numbers=f"rho {_numbers(near)} up to {NEAR:.0f} steps, {_numbers(local)} in all; {aliased:.1%} of the pairs more "
+                f"than {APART * limit:.0f} steps apart count as arrived",
+        good=min(near) >= RHO and aliased <= ALIASED,
+        expected=f"rho of {RHO} and more up to {NEAR:.0f} steps, at most {ALIASED:.0%}; far pairs are beyond what Q^l was "
+                 "taught",
+        advice="where recorded episodes above are fine and these are not, the encoder does not generalise to new scenes: "
+               "more contexts in the data, or train.group_windows")
+    yield Check(
+        title="Q^g against the shortest way to the goal",
+        numbers=f"rho {_numbers(value)}",
+        good=None,
+        expected=f"high near the goal; {RHO} and more over a whole maze is a luxury, the tree does without",
+        advice="see Q^g along episodes")
 
 
-def _of_curves(curves: Sequence[ValueCurve]) -> Finding:
+def _of_curves(curves: Sequence[ValueCurve]) -> Check:
     """Q^g along rewarded episodes."""
     rhos, errors = [curve.rho for curve in curves], [curve.steps_error for curve in curves]
     ends = [float(curve.values[-2]) for curve in curves]
-    return Finding(
-        "Q^g before the reward", f"{_numbers(ends)} at the rewarded action, rho with time over the {LAST} steps before it "
-        f"{_numbers(rhos)}, {_numbers(errors, 0)} steps off (median over all) along {len(curves)} episodes",
-        min(ends) >= 0.5 and min(rhos) >= RHO,
-        f"near 1 at the rewarded action, rho of {RHO} and more; far from the goal Q^g may flatten, the tree searches there",
-        "low at the end: too few rewards seen, raise train.rewarded_share or add successes; flat: train longer")
+    return Check(
+        title="Q^g before the reward",
+        numbers=f"{_numbers(ends)} at the rewarded action, rho with time over the {LAST} steps before it {_numbers(rhos)}, "
+                f"{_numbers(errors, 0)} steps off (median over all) along {len(curves)} episodes",
+        good=min(ends) >= 0.5 and min(rhos) >= RHO,
+        expected=f"near 1 at the rewarded action, rho of {RHO} and more; far from the goal Q^g may flatten, the tree "
+                 "searches there",
+        advice="low at the end: too few rewards seen, raise train.rewarded_share or add successes; flat: train longer")
 
 
-def _of_actions(actions: ActionValues) -> Finding:
+def _of_actions(actions: ActionValues) -> Check:
     """Q^g of actions against where they lead."""
     rhos = [actions.rho(far) for far in (False, True)]
-    return Finding(
-        "Q^g of recorded actions against what comes of them", f"rho {_numbers(rhos)} in the nearer and the farther half of "
-        f"{len(actions.away)} transitions (Q^g {LED} steps later)",
-        None if any(math.isnan(rho) for rho in rhos) else min(rhos) >= ACTION_RHO,
-        f"{ACTION_RHO} and more in both, 0.4 to 0.75 on our own tasks; π^g climbs Q^g over actions, so of two models the "
-        "one with the lower rho knows less where to go, however right its values along episodes are",
-        "low in the farther half: the critics see steps near the goal alone, train.critic_floor; low in the nearer half: "
-        "more rewarded data, or train.c3 for more imitation")
+    return Check(
+        title="Q^g of recorded actions against what comes of them",
+        numbers=f"rho {_numbers(rhos)} in the nearer and the farther half of {len(actions.away)} transitions (Q^g {LED} "
+                "steps later)",
+        good=None if any(math.isnan(rho) for rho in rhos) else min(rhos) >= ACTION_RHO,
+        expected=f"{ACTION_RHO} and more in both, 0.4 to 0.75 on our own tasks; π^g climbs Q^g over actions, so of two "
+                 "models the one with the lower rho knows less where to go, however right its values along episodes are",
+        advice="low in the farther half: the critics see steps near the goal alone, train.critic_floor; low in the nearer "
+               "half: more rewarded data, or train.c3 for more imitation")
 
 
-def _of_trees(trees: Trees, discount: float) -> Iterator[Finding]:
+def _of_trees(trees: Trees, discount: float) -> Iterator[Check]:
     """Plans."""
     numbers = trees.numbers
     reached = sum(each.reached_goal for each in numbers)
     nodes = [each.nodes for each in numbers]
     best = [each.best_value for each in numbers]
     gains = [steps_from_q(each.start_value, discount) - steps_from_q(each.best_value, discount) for each in numbers]
-    yield Finding(
-        "Trees", f"{reached} of {len(numbers)} plans find the goal (Q^g above {trees.goal_value:.2f}); best Q^g "
-        f"{_numbers(best)}, {_numbers(gains, 0)} steps nearer than the start; {min(nodes)} to {max(nodes)} nodes",
-        all(each.reached_goal or gain >= GAIN for each, gain in zip(numbers, gains, strict=True)),
-        f"the goal, or where it is far a place at least {GAIN:.0f} steps nearer by Q^g",
-        _tree_advice(numbers))
+    yield Check(
+        title="Trees",
+        numbers=f"{reached} of {len(numbers)} plans find the goal (Q^g above {trees.goal_value:.2f}); best Q^g "
+                f"{_numbers(best)}, {_numbers(gains, 0)} steps nearer than the start; {min(nodes)} to {max(nodes)} nodes",
+        good=all(each.reached_goal or gain >= GAIN for each, gain in zip(numbers, gains, strict=True)),
+        expected=f"the goal, or where it is far a place at least {GAIN:.0f} steps nearer by Q^g",
+        advice=_tree_advice(numbers))
     distances = [each.distance for each in numbers]
     typical = float(np.median(distances))
-    yield Finding(
-        "Tree nodes against real states", f"nodes are {_numbers(distances)} one-step lengths from the nearest frame of "
-        f"the data (means), recorded states that were kept apart {trees.held_out_distance:.2f}",
-        typical <= max(SUPPORT_FACTOR * trees.held_out_distance, 1.0),
-        f"at most a step, or {SUPPORT_FACTOR} times as far as recorded states", "the tree leaves the data: planner.anchor="
-        "reject, fewer planner.n_sim, or better dynamics; from new scenes some excess is normal")
+    yield Check(
+        title="Tree nodes against real states",
+        numbers=f"nodes are {_numbers(distances)} one-step lengths from the nearest frame of the data (means), recorded "
+                f"states that were kept apart {trees.held_out_distance:.2f}",
+        good=typical <= max(SUPPORT_FACTOR * trees.held_out_distance, 1.0),
+        expected=f"at most a step, or {SUPPORT_FACTOR} times as far as recorded states",
+        advice="the tree leaves the data: planner.anchor=reject, fewer planner.n_sim, or better dynamics; from new scenes "
+               "some excess is normal")
     if trees.scene_distance is not None and trees.scene_spacing is not None:
-        yield Finding(
-            "Tree nodes against their own scene", f"nodes from {numbers[0].start} are {trees.scene_distance:.2f} one-step "
-            f"lengths from the nearest real state of that scene, its real states {trees.scene_spacing:.2f} from each other",
-            trees.scene_distance <= max(SUPPORT_FACTOR * trees.scene_spacing, 1.0),
-            f"at most a step, or {SUPPORT_FACTOR} times as far as real states", "the tree drifts into other scenes or out "
-            "of all: more contexts in the data, fewer planner.n_sim, shorter edges (planner.discard_low_exponent)")
+        yield Check(
+            title="Tree nodes against their own scene",
+            numbers=f"nodes from {numbers[0].start} are {trees.scene_distance:.2f} one-step lengths from the nearest real "
+                    f"state of that scene, its real states {trees.scene_spacing:.2f} from each other",
+            good=trees.scene_distance <= max(SUPPORT_FACTOR * trees.scene_spacing, 1.0),
+            expected=f"at most a step, or {SUPPORT_FACTOR} times as far as real states",
+            advice="the tree drifts into other scenes or out of all: more contexts in the data, fewer planner.n_sim, "
+                   "shorter edges (planner.discard_low_exponent)")
 
 
 def _tree_advice(numbers: Sequence[TreeNumbers]) -> str:
@@ -182,13 +199,18 @@ def _tree_advice(numbers: Sequence[TreeNumbers]) -> str:
     return f"{advice}; or raise planner.n_iter"
 
 
-def _of_failures(failures: Failures) -> Finding:
+def _of_failures(failures: Failures) -> Check:
     """Episodes."""
     counts = {kind: count for kind, count in failures.counts.items() if count}
     failed = {kind: count for kind, count in counts.items() if kind != "solved"}
     advice = REMEDIES[max(failed, key=lambda kind: failed[kind])] if failed else "nothing failed"
     text = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    return Finding("Episodes", text, 2 * failures.counts["solved"] >= len(failures.outcomes), "solved ones", advice)
+    return Check(
+        title="Episodes",
+        numbers=text,
+        good=2 * failures.counts["solved"] >= len(failures.outcomes),
+        expected="solved ones",
+        advice=advice)
 
 
 def _numbers(values: Sequence[float], digits: int = 2) -> str:
@@ -200,7 +222,7 @@ def page(diagnosis: Diagnosis) -> str:
     lines = [f"# Diagnosis of {diagnosis.subject}", "", f"Written by `{diagnosis.command}`. {diagnosis.origin}", ""]
     lines += [f"Left out: {text}\n" for text in diagnosis.left_out]
     lines += [f"- {each.mark} **{each.title}**: {each.numbers}. *Expected*: {each.expected}. *Otherwise*: {each.advice}."
-              for each in findings(diagnosis)]
+              for each in checks(diagnosis)]
     lines += ["", "Faults spread downwards: mend the first `LOOK` first. One-step length: mean distance of subsequent "
               f"encodings, {diagnosis.rollout.one_step:.3g}. Q-values are read as steps by log_γ; the bounds are rules of "
               "thumb.", ""]

@@ -22,7 +22,7 @@ from velap.envs.protocol import Expert, Mapped, Walled
 from velap.evaluation.evaluate import Player, reset_options
 from velap.evaluation.rollout import FrameReader, play_without_frames
 from velap.models.velap import LatentModel
-from velap.report.diagnose.model import Album, ValueCurve, local_steps, rank_correlation, value_curve
+from velap.report.diagnose.model import RealStates, ValueCurve, local_steps, rank_correlation, value_curve
 from velap.report.diagnose.plans import Starts
 from velap.report.figures import probe
 
@@ -36,7 +36,7 @@ _POINT = 1e-4
 """Half side of the goal region that stands for a point [m]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scene:
     """A maze whose true distances are known, against Q^l and Q^g."""
 
@@ -88,7 +88,7 @@ def look_at_scene(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader,
                   count: int = PROBED) -> Scene:
     """Probe the maze of that test seed."""
     rng = np.random.default_rng(seed)
-    seen = probe(model, env, read, frame_stack, rng, count, seed)
+    seen = probe(model, env, read, frame_stack=frame_stack, rng=rng, count=count, seed=seed)
     world: Any = env.unwrapped
     places = np.stack([world.layout.nearest_free(place) for place in seen.positions])
     latents = torch.from_numpy(seen.latents).to(next(model.parameters()).device)
@@ -101,14 +101,21 @@ def look_at_scene(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader,
     pair_steps, pair_local, goal_steps = np.concatenate(true), np.concatenate(local), world.geodesic_steps(places)
     # where the block touches a wall, a rounding error may leave it no way at all
     known, reachable = np.isfinite(pair_steps), np.isfinite(goal_steps)
-    return Scene(seed, goal_steps[reachable], seen.values[reachable].astype(np.float64), pair_steps[known],
-                 pair_local[known])
+    return Scene(
+        seed=seed,
+        goal_steps=goal_steps[reachable],
+        values=seen.values[reachable].astype(np.float64),
+        pair_steps=pair_steps[known],
+        pair_local=pair_local[known])
 
 
-def scenery(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_stack: int, seed: int) -> Album:
+def scenery(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_stack: int, seed: int) -> RealStates:
     """Real states of the scene of that test seed."""
-    seen = probe(model, env, read, frame_stack, np.random.default_rng(seed), seed=seed)
-    return Album("the same scene", torch.from_numpy(seen.latents).to(next(model.parameters()).device), seen.frames)
+    seen = probe(model, env, read, frame_stack=frame_stack, rng=np.random.default_rng(seed), seed=seed)
+    return RealStates(
+        source="the same scene",
+        latents=torch.from_numpy(seen.latents).to(next(model.parameters()).device),
+        frames=seen.frames)
 
 
 def stack_all(frames: Sequence[NDArray[np.uint8]], frame_stack: int) -> NDArray[np.uint8]:
