@@ -76,7 +76,7 @@ def test_the_demo_solves_films_and_draws(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(demo, "load_player", lambda what: toy_player())
     monkeypatch.setattr(demo, "latent_map_of", lambda player: probe_few(player))
     console = Console(record=True, width=100, file=(tmp_path / "log").open("w"))
-    summary = demo.run_demo(console, "toy", tmp_path / "any", 2, tmp_path / "out", "cpu")
+    summary = demo.run_demo(console, "toy", checkpoint=tmp_path / "any", episodes=2, out=tmp_path / "out", device="cpu")
     assert (summary.episodes, summary.successes) == (2, 2)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["episodes.mp4", "plan.png"]
     assert "100.0 (34.2 to 100.0)" in console.export_text()
