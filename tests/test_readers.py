@@ -264,6 +264,23 @@ def test_several_cameras_are_listed_and_one_is_chosen(root: Path) -> None:
     assert load_store(source, image_key="observation.images.wrist").reading.image_key == "observation.images.wrist"
 
 
+def test_float_cameras_count_and_depth_maps_do_not(root: Path) -> None:
+    source = write_robomimic(recorded(), root / "depth.hdf5")
+    with h5py.File(source, "r+") as file:
+        for name in file["data"]:
+            depth = np.random.default_rng(0).uniform(0, 3, file[f"data/{name}/obs/agentview_image"].shape[:3])
+            file[f"data/{name}/obs/agentview_depth"] = depth.astype(np.float32)[..., None]
+    same(load_store(source), stored(recorded()))
+    with h5py.File(source, "r+") as file:
+        for name in file["data"]:
+            for group in ("obs", "next_obs"):
+                images = file[f"data/{name}/{group}/agentview_image"][:]
+                file[f"data/{name}/{group}/wrist_image"] = (images / 255).astype(np.float32)
+    with pytest.raises(DatasetError, match=r"several images.*: agentview_image, wrist_image"):
+        load_store(source)
+    same(load_store(source, image_key="wrist_image"), stored(recorded()))
+
+
 def test_what_the_last_row_says_counts_for_the_last_frame(root: Path) -> None:
     """LeRobot and robomimic store no frame behind the last action; a success there is not lost."""
     episodes = recorded()

@@ -215,9 +215,9 @@ def build_from_episodes(episodes: Iterable[Episode], name: str, bounds: tuple[An
 
 def image_space(images: np.ndarray) -> gym.Space:
     """The space of images [T + 1, *]; float ones have the narrowest bounds of FLOAT_RANGES that hold them."""
-    if images.dtype == np.uint8 or not np.issubdtype(images.dtype, np.floating):
-        dtype: Any = images.dtype if images.dtype.kind in "iu" else np.uint8
-        return gym.spaces.Box(0, 255, images.shape[1:], dtype)
+    if not np.issubdtype(images.dtype, np.floating):
+        largest = 255 if images.dtype == np.uint8 else np.iinfo(images.dtype).max
+        return gym.spaces.Box(0, largest, images.shape[1:], images.dtype.type)
     low, high = float(images.min()), float(images.max())
     bounds = next((pair for pair in FLOAT_RANGES if pair[0] <= low and high <= pair[1]), (-np.inf, np.inf))
     return gym.spaces.Box(*bounds, images.shape[1:], images.dtype.type)

@@ -108,7 +108,7 @@ def find_image(space: gym.Space, image_key: str | None, where: str,
         leaves = {path: leaves[path]}
     found = [layout for path, leaf in leaves.items() if (layout := _layout(path, leaf)) is not None]
     if len(found) > 1:
-        found = [layout for layout in found if layout.dtype == "uint8"] or found
+        found = [layout for layout in found if _is_picture(layout, leaves[layout.key])] or found
     if not found:
         raise DatasetError(f"{where} has no image among its observations ({_listing(leaves)}); expected images "
                            f"[H, W, 3]. velap learns from pixels: {advice}.")
@@ -116,12 +116,22 @@ def find_image(space: gym.Space, image_key: str | None, where: str,
         cameras = ", ".join(layout.name for layout in found)
         raise DatasetError(f"{where} has several images among its observations: {cameras}; expected one. "
                            f"Name the one to use with --image-key, for example --image-key {found[0].name}.")
-    box = leaves[found[0].key]
+    return _checked(found[0], leaves[found[0].key], where, fit)
+
+
+def _is_picture(layout: ImageLayout, box: gym.Space) -> bool:
+    """Is it a picture, and no depth map or mask beside one?"""
+    if layout.dtype == "uint8":
+        return True
+    return layout.channels == 3 and _bounds(box) in FLOAT_RANGES
+
+
+def _bounds(box: gym.Space) -> tuple[float, float]:
     assert isinstance(box, gym.spaces.Box)
-    return _checked(found[0], box, where, fit)
+    return float(box.low.min()), float(box.high.max())
 
 
-def _checked(layout: ImageLayout, box: gym.spaces.Box, where: str, fit: Fit | None) -> ImageLayout:
+def _checked(layout: ImageLayout, box: gym.Space, where: str, fit: Fit | None) -> ImageLayout:
     """The layout with its bounds; raises DatasetError where it cannot become an RGB square."""
     what = f"{where}: {layout.name or 'the observation'} is {box.dtype} of shape {layout.shape}"
     if len(layout.shape) == 4:
@@ -137,8 +147,8 @@ def _checked(layout: ImageLayout, box: gym.spaces.Box, where: str, fit: Fit | No
                            "--fit pad (black beside them) or --fit squash.")
     if box.dtype == np.uint8:
         return layout
-    bounds = (float(box.low.min()), float(box.high.max()))
-    if not np.issubdtype(box.dtype, np.floating) or bounds not in FLOAT_RANGES:
+    bounds = _bounds(box)
+    if not np.issubdtype(np.dtype(layout.dtype), np.floating) or bounds not in FLOAT_RANGES:
         raise DatasetError(f"{what} from {bounds[0]:g} to {bounds[1]:g}; expected uint8, or floats with the bounds 0 and 1, "
                            "-1 and 1, or 0 and 255. Convert it, for values in 0 to 1: np.round(255 * "
                            "frame).astype(np.uint8).")

@@ -14,6 +14,7 @@ import gymnasium as gym
 import h5py
 import numpy as np
 
+from velap.data.building import image_space
 from velap.data.frames import Episode
 from velap.data.images import ImageLayout
 from velap.data.loading import files_state
@@ -24,8 +25,8 @@ from velap.registry import register_reader
 def _space(group: Any) -> gym.Space:
     """The space of one observation of a group of arrays [T, *]."""
     if isinstance(group, h5py.Dataset):
-        if group.dtype == np.uint8:
-            return gym.spaces.Box(0, 255, group.shape[1:], np.uint8)
+        if group.ndim >= 3 and group.dtype.kind in "uf":
+            return image_space(group[:64])
         return gym.spaces.Box(-np.inf, np.inf, group.shape[1:], group.dtype.type)
     return gym.spaces.Dict({name: _space(group[name]) for name in group})
 
