@@ -36,7 +36,8 @@ SHARP = np.cos(np.radians(40.0))
 CELL = 0.015
 """Side of the cubes within which vertices of a mesh are drawn together [m]. ours: one pixel at the middle of the view."""
 SMALL_MESH = 1000
-"""Meshes of up to so many triangles stay as they are. ours: those of all objects; the arm's have 2,400 and more."""
+"""Meshes with at most this number of triangles stay as they are. ours: those of all objects; the arm's have 2,400 and
+more."""
 TEXTURE_SIZE = 128
 """Side of a texture, at most [texels]. ours: the table is 70 px wide in the frame."""
 STATIC_BODIES = ("tablelink", "RetainingWall", "base")

@@ -80,7 +80,7 @@ class Comparison:
 
 
 def compare(task: str, seeds: Sequence[int] = SEEDS, every: int = EVERY) -> Comparison:
-    """Draw test episodes of the expert both ways, every so many steps, start and success included."""
+    """Draw test episodes of the expert both ways at regular steps, start and success included."""
     env: Any = gym.make(f"velap.envs:{get_task(task).env_id}").unwrapped
     original = OriginalScene(env.model)
     pairs = [(original.draw(env.model, env.data), env.render()) for seed in seeds for _ in _states(env, seed, every)]
@@ -89,7 +89,7 @@ def compare(task: str, seeds: Sequence[int] = SEEDS, every: int = EVERY) -> Comp
 
 
 def _states(env: Any, seed: int, every: int) -> Iterator[int]:
-    """Walk the environment through an episode of its expert; stops at every so many steps and at its end."""
+    """Walk the environment through an episode of its expert; stops at regular steps and at its end."""
     env.reset(seed=seed)
     yield 0
     for step in range(1, 300):

@@ -14,7 +14,7 @@ OWN_RECORDS, SHIPPED_RECORDS = Path("runs/records"), Path("results/records")
 
 
 def run_dir(task: str, preset: str, seed: int) -> Path:
-    """Where a training run lives unless said otherwise."""
+    """Default folder of a training run."""
     return Path("runs") / task.replace("/", "_") / preset / f"seed{seed}"
 
 

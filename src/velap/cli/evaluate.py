@@ -30,12 +30,12 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
         env_kwargs: Arguments of the environment, such as `obs_type=pixels`.
         image_key: Key of the image in dict observations.
         max_steps: Time limit where the environment has none, or a shorter one.
-        success: What counts as success, such as `reward>=0`, `info:success` or `terminated`; the rule that the checkpoint
-            keeps unless said.
+        success: What counts as success, such as `reward>=0`, `info:success` or `terminated`. Default: the rule that the
+            checkpoint keeps.
         fresh: Move an existing record file aside first.
         batch: Environments at once.
         video: Film the first episode as well.
-        head: What the method learnt; METHOD.safetensors beside the checkpoint unless said.
+        head: What the method learnt. Default: METHOD.safetensors beside the checkpoint.
     """
     from velap.evaluation.evaluate import Evaluation
     from velap.methods.base import get_method
@@ -90,16 +90,16 @@ def diagnose(task: Positional[str | None] = None, checkpoint: Path | None = None
 
     Args:
         task: Task name; leave it out with --dataset.
-        checkpoint: `model.safetensors` of a run; the task's released one unless said.
-        dataset: Minari dataset that the model is compared with; the task's own unless said.
-        out: Folder of the report; runs/diagnosis/TASK unless said.
+        checkpoint: `model.safetensors` of a run. Default: the task's released one.
+        dataset: Minari dataset that the model is compared with. Default: the task's own.
+        out: Folder of the report. Default: runs/diagnosis/TASK.
         episodes: Episodes that are run and judged.
         first_seed: Seed of the first one; seeds 0 to 99 are the test episodes and refused.
         env: Any Gymnasium id instead of the task's own.
         env_kwargs: Arguments of the environment, such as `obs_type=pixels`.
         image_key: Key of the image in dict observations.
         max_steps: Time limit where the environment has none, or a shorter one.
-        success: What counts as success, such as `reward>=0`; the rule that the checkpoint keeps unless said.
+        success: What counts as success, such as `reward>=0`. Default: the rule that the checkpoint keeps.
     """
     from velap.report.diagnose.command import Request, run_diagnose
 

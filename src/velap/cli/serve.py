@@ -26,8 +26,8 @@ def serve(checkpoint: Checkpoint, method: str = "velap", host: str = "127.0.0.1"
         method: VELAP or another method of `velap evaluate`.
         host: Address to listen on; one that other machines reach needs a key.
         port: Port to listen on.
-        image_key: Key of the camera's picture in observations, `a/b` when nested; the only picture unless said.
-        head: What the method learnt; METHOD.safetensors beside the checkpoint unless said.
+        image_key: Key of the camera's picture in observations, `a/b` when nested. Default: the only picture.
+        head: What the method learnt. Default: METHOD.safetensors beside the checkpoint.
     """
     import asyncio
     import logging

@@ -25,12 +25,12 @@ def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make
     time: the same command goes on from there.
 
     Args:
-        records: Root of the episode records; runs/records unless said, with `1` those of the published tables in
-            results/records.
+        records: Root of the episode records. Default: runs/records; with `1` results/records, those of the published
+            tables.
         write: Document to update between its table marks, such as docs/records.md; with `1` docs/results.md, or another one
             to write.
-        only: Cells to run, such as `task=SpiralMaze method=bc,iql`. Axes are task, method, preset and seed; unless said all
-            tasks, all methods, preset=default and seed=0.
+        only: Cells to run, such as `task=SpiralMaze method=bc,iql`. Axes are task, method, preset and seed. Default: all
+            tasks, all methods, preset=default, seed=0.
         jobs: Jobs at once, on one machine; each gets its share of the cores.
         dry_run: Only say what is there, what is missing and which jobs would run.
         no_run: Only write the table from the records that are there.
@@ -63,7 +63,7 @@ def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device =
 
     Args:
         json: Write them to this file as well, such as results/bench/cpu.json.
-        only: Names of the benchmarks to measure, such as plan_latency_1; all unless said.
+        only: Names of the benchmarks to measure, such as plan_latency_1. Default: all.
     """
     _study("speed.command").run_benchmarks(OUT, json, device, only)
 
@@ -102,7 +102,7 @@ def figure(name: Annotated[Positional[Literal["tasks", "tasks-widowx", "sawyer-d
     of the WidowX arm. `sawyer-drawing`: our drawing of the Sawyer arm beside Meta-World's geometry.
 
     Args:
-        write: Where it goes; docs/NAME.png (with _ for -) unless said.
+        write: Where it goes. Default: docs/NAME.png (with _ for -).
     """
     path = write or Path("docs") / f"{name.replace('-', '_')}.png"
     if name == "tasks":

@@ -20,8 +20,8 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
 
     Args:
         seed: Decides every array, whatever the number of workers.
-        workers: Processes; one a core unless said.
-        dataset_id: Minari id to write; the task's own unless said.
+        workers: Processes. Default: one per core.
+        dataset_id: Minari id to write. Default: the task's own.
         overwrite: Replace a dataset of that id.
     """
     from velap.data.collection import collect as run
@@ -51,10 +51,10 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
         dataset: Minari dataset id, or path of a dataset in another format (LeRobot, robomimic, OGBench).
         image_key: Key of the image in dict observations.
         seed: Decides weights and batches.
-        out: Run directory; runs/TASK/PRESET/seedSEED unless said.
+        out: Run directory. Default: runs/TASK/PRESET/seedSEED.
         resume: Go on with the unfinished run in the run directory.
-        success: What counts as success, such as `reward>=0`, `info:success`, `terminated` or `labels:answers.csv`; found in
-            the data unless said.
+        success: What counts as success, such as `reward>=0`, `info:success`, `terminated` or `labels:answers.csv`. Default:
+            found in the data.
         fit: How images that are not square become square.
         image_size: Side that images are resized to [px].
         mapped: Map the frames from a file beside the dataset instead of reading them into memory.
@@ -108,9 +108,9 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
     Args:
         seed: Decides weights and batches.
         episodes: Test episodes, seeds from 0.
-        out: Run directory; runs/TASK/PRESET/seedSEED unless said.
+        out: Run directory. Default: runs/TASK/PRESET/seedSEED.
         fresh: Move an existing record file aside first.
-        workers: Processes that collect; one a core unless said.
+        workers: Processes that collect. Default: one per core.
     """
     from velap.api import config_for
     from velap.cli.evaluate import evaluate_with_progress

@@ -54,7 +54,7 @@ class Evaluation:
     image_key: str | None = None
     """Key of the image in dict observations."""
     max_steps: int | None = None
-    """Time limit [steps], where it is shorter than the environment's own or the environment has none."""
+    """Time limit [steps], if it is shorter than the environment's own or the environment has no limit."""
     success: str | None = None
     """What counts as success, a rule of `velap.data.success`; None takes the one that the checkpoint keeps."""
     device: str = "auto"

@@ -52,7 +52,7 @@ STARTS = 5
 SCENES = 3
 """Scenes and expert's episodes. ours."""
 LONGEST = 20
-"""Rollouts are followed for at most so many steps [steps]. ours."""
+"""Longest rollout that is followed [steps]. ours."""
 PAGE = "report.md"
 
 

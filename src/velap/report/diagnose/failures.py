@@ -160,7 +160,7 @@ class Tracer:
     def __init__(self, every: int) -> None:
         self.traces: dict[int, Trace] = {}
         self._every = every
-        """A frame is kept every so many steps [steps]."""
+        """Steps between two kept frames [steps]."""
 
     def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
         """One state of one episode."""

@@ -39,8 +39,8 @@ REWARDED = 3
 LAST = 20
 """Steps before the reward over which Q^g has to rise; farther away it may be flat, a tree searches there [steps]. ours."""
 LED = 5
-"""The value of an action is compared with that of the state so many steps later [steps]. ours: recorded actions last some
-steps, and one step is hardly more than the noise of a value."""
+"""The value of an action is compared with that of the state this number of steps later [steps]. ours: recorded actions last
+some steps, and one step is hardly more than the noise of a value."""
 FEWEST = 50
 """Transitions that a correlation is taken over at least. ours."""
 APART = 2.0
