@@ -11,7 +11,6 @@ import dataclasses
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,21 +21,22 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
 
-from velap.config import Config, override
+from velap.config import Config, ModelConfig, override
 from velap.data.behaviours import run_trajectory
 from velap.data.frames import FrameStore
-from velap.data.sampling import WindowSampler
 from velap.envs.protocol import WithTrueState
 from velap.errors import ConfigError
 from velap.evaluation.console import ProgressBar
 from velap.evaluation.evaluate import make_env, reset_options
 from velap.evaluation.rollout import FrameReader, Rollout, make_envs
 from velap.methods.base import make_agent
-from velap.models.velap import LatentModel, Spaces
+from velap.models.encoders.base import Encoder
+from velap.models.velap import LatentModel
+from velap.registry import register_encoder
 from velap.runs import make_generator, write_atomic
 from velap.tasks import Task, get_task, make_config
 from velap.training.diagnostics import measure_latents
-from velap.training.joint import JointLearner
+from velap.training.loop import Trainer
 
 EPISODES, QUICK_EPISODES, FIRST_SEED = 50, 10, 1000
 """Validation episodes."""
@@ -51,34 +51,24 @@ SIDE = 64
 """Of the pictures that carry a state in their bytes [px]."""
 
 
-def pack(state: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """A state [S] in the first bytes of a picture uint8 [64, 64, 3]."""
-    picture = np.zeros(SIDE * SIDE * 3, np.uint8)
+def pack(state: NDArray[np.float32], joints: int, shape: tuple[int, ...] = (SIDE, SIDE, 3)) -> NDArray[np.uint8]:
+    """A state [S] as a picture uint8: S, the number of joints, then the bytes of the state."""
     raw = np.frombuffer(state.astype(np.float32).tobytes(), np.uint8)
-    picture[: len(raw)] = raw
-    return picture.reshape(SIDE, SIDE, 3)
+    picture = np.zeros(int(np.prod(shape)), np.uint8)
+    picture[: 2 + len(raw)] = np.concatenate([np.array([len(state), joints], np.uint8), raw])
+    return picture.reshape(shape)
 
 
-def unpack(pictures: NDArray[np.uint8], entries: int) -> NDArray[np.float32]:
-    """States [*, S] of pictures uint8 [*, 64, 64, 3]."""
-    flat = np.ascontiguousarray(pictures.reshape(*pictures.shape[:-3], -1)[..., : 4 * entries])
-    return flat.view(np.float32)
+def unpack(pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], int]:
+    """States [*, S] of pictures uint8 [*, H, W, 3], and the number of joints."""
+    flat = pictures.reshape(*pictures.shape[:-3], -1)
+    entries, joints = (int(value) for value in flat.reshape(-1, flat.shape[-1])[0, :2])
+    return np.ascontiguousarray(flat[..., 2 : 2 + 4 * entries]).view(np.float32), joints
 
 
-@dataclass(frozen=True)
-class States:
-    """The data of a task without its pictures."""
-
-    store: FrameStore
-    """Its frames [F, 1, 1, 3] hold the number of their row, base 256."""
-    states: NDArray[np.float32]
-    """[F, S] `SawyerTask.true_state`."""
-    joints: int
-    """How many of the entries after the hand's three are joints."""
-
-
-def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: ProgressBar | None = None) -> States:
-    """The trajectories that `velap collect` records, step for step, without drawing; `contexts` of them all where given."""
+def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: ProgressBar | None = None) -> FrameStore:
+    """The trajectories that `velap collect` records, step for step, with packed states in place of frames; `contexts` of
+    them all where given."""
     env: Any = make_env(task.env_id).unwrapped
     if not isinstance(env.unwrapped, WithTrueState):
         raise ConfigError(f"{task.name} tells no true state; expected one of the manipulation tasks.")
@@ -92,77 +82,73 @@ def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view:
             view.show(context + 1)
     rows = {name: np.concatenate([run[name] for run in runs])
             for name in ("frames", "actions", "rewards", "terminated", "truncated", "length")}
-    number = np.arange(len(rows["rewards"]))
-    frames = np.stack([number >> 16, number >> 8 & 255, number & 255], -1).astype(np.uint8).reshape(-1, 1, 1, 3)
+    joints = len(env.joints)
+    width = -(-(2 + 4 * rows["frames"].shape[1]) // 3)
+    frames = np.stack([pack(state, joints, (1, width, 3)) for state in rows["frames"]])
     space = env.action_space
-    store = FrameStore.from_arrays(frames=frames, actions=rows["actions"], rewards=rows["rewards"],
-                                   terminated=rows["terminated"], truncated=rows["truncated"],
-                                   episode_length=rows["length"], action_low=space.low, action_high=space.high,
-                                   dataset_id=f"{task.name}/states")
-    return States(store, rows["frames"].astype(np.float32), len(env.joints))
+    return FrameStore.from_arrays(frames=frames, actions=rows["actions"], rewards=rows["rewards"],
+                                  terminated=rows["terminated"], truncated=rows["truncated"],
+                                  episode_length=rows["length"], action_low=space.low, action_high=space.high,
+                                  dataset_id=f"{task.name}/states")
 
 
-class ExactEncoder:
-    """Stands in for φ: hand, joints and places in sizes that count alike, and the hand's last two steps; zeros behind."""
+@register_encoder("exact-states")
+class ExactEncoder(Encoder):
+    """Hand, joints and places in sizes that count alike, and the hand's last two steps; zeros behind."""
 
-    def __init__(self, data: States, latent_dim: int) -> None:
-        self._states = data.states
-        self._latent_dim, entries = latent_dim, data.states.shape[1]
-        if entries + 6 > latent_dim:
-            raise ConfigError(f"config field `latent_dim` is {latent_dim}; expected at least {entries + 6} for this state.")
-        self._mean = data.states.mean(0)
-        scale = data.states.std(0)
+    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
+        super().__init__()
+        self.latent_dim = config.latent_dim
+        self.mean: NDArray[np.float32] = np.zeros(1, np.float32)
+        self.scale: NDArray[np.float32] = np.ones(1, np.float32)
+
+    def fit(self, frames: Tensor, last: Tensor, seed: int) -> Tensor:
+        """What is one in each entry [S], by the states of the data."""
+        states, joints = unpack(frames.numpy())
+        entries = states.shape[1]
+        if entries + 6 > self.latent_dim:
+            raise ConfigError(f"config field `latent_dim` is {self.latent_dim}; expected at least {entries + 6} for this "
+                              "state.")
+        self.mean, scale = states.mean(0), states.std(0)
         scale[:3] = HAND
-        joints = slice(3, 3 + data.joints)
-        scale[joints] = JOINT_SHARE * np.ptp(data.states[:, joints], axis=0)
-        self._scale = np.maximum(scale, LEAST)
+        moving = slice(3, 3 + joints)
+        scale[moving] = JOINT_SHARE * np.ptp(states[:, moving], axis=0)
+        self.scale = np.maximum(scale, LEAST)
+        return frames
 
-    def __call__(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
-        """Frames of the data [*, N, 1, 1, 3] or packed states [*, N, 64, 64, 3] -> latents [*, D]."""
-        pictures = frames.numpy()
-        if pictures.shape[-3] == 1:
-            digits = pictures[..., 0, 0, :].astype(np.int64)
-            states = self._states[digits @ np.array([65536, 256, 1])]
-        else:
-            states = unpack(pictures, self._states.shape[1])
-        return torch.from_numpy(self.latents(states))
+    def encode(self, stacks: Tensor) -> Tensor:
+        """Packed states uint8 [M, N, H, W, 3] -> latents [M, D]."""
+        return torch.from_numpy(self.latents(unpack(stacks.numpy())[0]))
 
     def latents(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
         """Stacked states [*, N, S], oldest first -> [*, D]."""
         hand = states[..., :3]
         last = hand[..., -1, :] - hand[..., max(hand.shape[-2] - 2, 0), :]
         before = hand[..., max(hand.shape[-2] - 2, 0), :] - hand[..., max(hand.shape[-2] - 3, 0), :]
-        known = np.concatenate([(states[..., -1, :] - self._mean) / self._scale, last / STEP, before / STEP], -1)
-        latent = np.zeros((*known.shape[:-1], self._latent_dim), np.float32)
+        known = np.concatenate([(states[..., -1, :] - self.mean) / self.scale, last / STEP, before / STEP], -1)
+        latent = np.zeros((*known.shape[:-1], self.latent_dim), np.float32)
         latent[..., : known.shape[-1]] = known
         return latent
 
 
-def learn(data: States, config: Config, seed: int, view: ProgressBar | None = None) -> LatentModel:
-    """A model in eval mode, taught by all phases of the config that work on a frozen encoder."""
-    train = dataclasses.replace(config.train, encoder_steps=0, joint_steps=0, reconstruction=0.0)
-    device = torch.device("cpu")
-    sampler = WindowSampler(data.store, train, config.model.frame_stack, device, np.zeros(0, np.int64))
-    store = data.store
-    spaces = Spaces(SIDE, SIDE, tuple(map(float, store.action_low)), tuple(map(float, store.action_high)))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        # the true state holds the speed of the hand, and there is no picture to measure
-        blind = dataclasses.replace(config.model, latent_dim=config.model.learnt_dim, command_memory=0.0, moment_colours=0,
-                                    slow_features=0, keep_moments=False)
-        model = LatentModel(blind, spaces, train.discount, train.precision).train()
-    model.encode = ExactEncoder(data, blind.latent_dim)  # type: ignore[method-assign]
-    learner = JointLearner(model, train, sampler, make_generator(seed, stream=1, device=device))
-    learner.begin_latent_phase()
-    done = 0
-    for phase, steps in train.phases:
-        for step in range(steps):
-            learner.frozen_step(phase, step, steps)
-            done += 1
-            if view is not None:
-                view.show(done, title=f"exact latents, {phase} phase")
-    model.eval()
-    measure_latents(model, sampler, make_generator(seed, stream=2))
+def on_states(config: Config) -> Config:
+    """The config with the true state in place of φ: phases on frozen latents alone. The state holds the speed of the
+    hand."""
+    train = dataclasses.replace(config.train, phases=tuple(phase for phase in config.train.phases if phase.frozen))
+    model = dataclasses.replace(config.model, encoder="exact-states", command_dims=0)
+    return dataclasses.replace(config, model=model, train=train)
+
+
+def learn(data: FrameStore, config: Config, seed: int, view: ProgressBar | None = None) -> LatentModel:
+    """A model in eval mode, taught by all phases of `on_states`."""
+    trainer = Trainer(config, data, Path("runs") / "exact", seed, torch.device("cpu"))
+    while trainer.step < trainer.total:
+        trainer.update()
+        if view is not None:
+            view.show(trainer.step, title=f"exact latents, {trainer.phase} phase")
+    model = trainer.model.eval()
+    model.spaces = dataclasses.replace(model.spaces, height=SIDE, width=SIDE)  # episodes pack states into square pictures
+    measure_latents(model, trainer.sampler, make_generator(seed, stream=2))
     return model
 
 
@@ -172,7 +158,7 @@ def play(task: Task, model: LatentModel, config: Config, *, method: str, seeds: 
     def make() -> gym.Env[Any, Any]:
         env = make_env(task.env_id)
         world: Any = env.unwrapped
-        world.render = lambda size=SIDE: pack(world.true_state())
+        world.render = lambda size=SIDE: pack(world.true_state(), len(world.joints))
         return env
 
     envs = make_envs(make, min(BATCH, len(seeds)))
@@ -192,12 +178,11 @@ def study_exact_latents(
 ) -> list[dict[str, Any]]:
     """Collect, learn, play and print; the figures go to `path` as JSON where given. One row a method."""
     task = get_task(name)
-    config = override(make_config(name), **(changes or {}))
+    config = on_states(override(make_config(name), **(changes or {})))
     began = time.monotonic()
     with ProgressBar(console, f"states of {name}", contexts or task.recipe.contexts) as view:
         data = collect_states(task, contexts, view=view)
-    steps = sum(count for phase, count in config.train.phases if phase not in ("encoder", "joint"))
-    with ProgressBar(console, "exact latents", steps) as view:
+    with ProgressBar(console, "exact latents", config.train.steps) as view:
         model = learn(data, config, seed, view)
     seeds = range(FIRST_SEED, FIRST_SEED + (QUICK_EPISODES if quick else EPISODES))
     rows: list[dict[str, Any]] = []

@@ -10,21 +10,21 @@ import math
 import torch
 
 from velap.config.planning import PlannerConfig
-from velap.search.sampling import Noise
+from velap.search.sampling import TEMPERATURE_SPARSE, TEMPERATURE_VALUE, Noise
 from velap.search.types import SearchFns
 
 
 def reference_plan(fns: SearchFns, root: torch.Tensor, cfg: PlannerConfig, noise: Noise) -> dict[str, list]:
     """Tree and path for one root [D] from the first row of the noise."""
     gamma, low = fns.discount, cfg.n_sim if cfg.discard_low_exponent is None else cfg.discard_low_exponent
-    tau_std = 1 - gamma if cfg.discard_std is None else cfg.discard_std
+    tau_std = 1 - gamma
     q_min = lambda start, end: float(fns.reach(start, end)[0])  # noqa: E731
     nodes, parents, values, steps, counts, expansions = [root], [-1], [float(fns.value(root))], [0.0], [0], [0]
     for i in range(cfg.n_iter):
         if i % cfg.candidates == 0:
             crowding = [n + cfg.expansion_weight * e for n, e in zip(counts, expansions, strict=True)]
-            sparse = [math.exp(-n / cfg.temperature_sparse) for n in crowding]
-            value = [math.exp(q / cfg.temperature_value) for q in values]
+            sparse = [math.exp(-n / TEMPERATURE_SPARSE) for n in crowding]
+            value = [math.exp(q / TEMPERATURE_VALUE) for q in values]
             uniform = 1 - cfg.p_sparse - cfg.p_value
             weights = [cfg.p_sparse * s / sum(sparse) + cfg.p_value * v / sum(value) + uniform / len(nodes)
                        for s, v in zip(sparse, value, strict=True)]

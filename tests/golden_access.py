@@ -20,9 +20,10 @@ import torch
 from torch import Tensor
 
 from velap import api
-from velap.config import Config, ModelConfig, override
-from velap.config.training import TrainConfig
+from velap.config import Config, ModelConfig, legacy_hash, override
+from velap.config.migrate_v1 import legacy_json, to_v1
 from velap.data.frames import FrameStore
+from velap.data.sampling import WholeWindows
 from velap.errors import CheckpointError
 from velap.evaluation.evaluate import make_env
 from velap.evaluation.records import read_records, record_path
@@ -31,13 +32,16 @@ from velap.methods.base import get_method, learning_methods, make_agent
 from velap.methods.heads import load_head, make_head
 from velap.methods.iris import SubgoalHead
 from velap.methods.learning import train_head
-from velap.models.velap import LatentModel, load_checkpoint, shared_weights
+from velap.models.checkpoint import load_checkpoint, shared_weights
+from velap.models.encoders.moments import KEPT_LIMIT, KEPT_SCALE, MomentEncoder, slow_features
+from velap.models.velap import LatentModel
 from velap.native.kernels import library
-from velap.registry import METHODS
+from velap.registry import ENCODERS, METHODS
 from velap.runs import content_sha256, load_tensors, make_generator
 from velap.tasks import TASKS, make_config
 from velap.training.frozen import latent_data
 from velap.training.loop import MODEL, STATE, Trainer, train
+from velap.training.phase import start_heads_afresh
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 HEADED = tuple(learning_methods())
@@ -124,50 +128,116 @@ def _random_head(method: str, config: Config, action_dim: int) -> Any:
 
 # Losses.
 
-TINY = ModelConfig(
-    frame_stack=2, latent_dim=4, encoder_filters=(4, 4), encoder_kernels=(4, 4), encoder_strides=(2, 2), encoder_dense=(8,),
-    dynamics_dense=(16,), generative_dense=(16,), noise_dim=2, policy_dense=(16,), critic_dense=(16,), bank_size=10)
-BRIEF = TrainConfig(
-    joint_steps=2, latent_steps=0, batch_windows=6, window=5, latent_horizon=3, encoder_pairs=8, value_transitions=12,
-    dynamics_rollouts=10, precision="float32", holdout_episodes=1)
-LATE: dict[str, Any] = {
-    "latent_steps": 2, "latent_value_steps": 2, "member_steps": 2, "members": 3, "distil_steps": 2, "held_steps": 2,
-    "clone_steps": 2, "clone_reach": 3}
-OWN: dict[str, Any] = {"success_policy": True, "held_policy": True}
-BEST: dict[str, Any] = {"critic_loss": "cross_entropy", "critic_floor": 0.02, "policy_relative": True}
-TEACHERS: dict[str, Any] = {"member_steps": 2, "members": 3, "distil_steps": UPDATES}
-HOLDERS: dict[str, Any] = {"held_steps": 2, "distil_steps": UPDATES}
+TINY: dict[str, Any] = {"frame_stack": 2, "latent_dim": 4, "bank_size": 10}
+BRIEF: dict[str, Any] = {"joint": {"steps": 2, "windows": 6, "window": 5}, "latent": {"steps": 0}}
+OWN: dict[str, Any] = {"clones": True, "holds": True}
+BEST: dict[str, Any] = {"critic_loss": "cross_entropy", "critic_floor": 0.02}
+SMALL_SIZES: dict[str, Any] = {
+    "velap.config.training.DISTIL_STEPS": UPDATES,
+    "velap.methods.heads.POLICY": (16,),
+    "velap.methods.iql.CRITIC": (16,),
+    "velap.methods.iris.GENERATIVE": (16,),
+    "velap.methods.iris.NOISE_DIM": 2,
+    "velap.methods.iris.POLICY": (16,),
+    "velap.models.encoders.conv.DENSE": (8,),
+    "velap.models.encoders.conv.FILTERS": (4, 4),
+    "velap.models.encoders.conv.KERNELS": (4, 4),
+    "velap.models.encoders.conv.PRECISION": torch.float32,
+    "velap.models.encoders.conv.STRIDES": (2, 2),
+    "velap.models.encoders.moments.COLOURS": 4,
+    "velap.models.encoders.moments.DENSE": (8,),
+    "velap.models.velap.COMMAND_MEMORY": 0.8,
+    "velap.models.velap.CRITIC": (16,),
+    "velap.models.velap.DYNAMICS": (16,),
+    "velap.models.velap.GENERATIVE": (16,),
+    "velap.models.velap.NOISE_DIM": 2,
+    "velap.models.velap.POLICY": (16,),
+    "velap.training.encoder.SIDE": 16,
+    "velap.training.ensemble.CRITIC": (16,),
+    "velap.training.ensemble.POLICY": (16,),
+    "velap.training.joint.WholeWindows": lambda windows, length, *_: WholeWindows(windows, length, 12, 10, 3),
+}
+"""Constants of today that were fields when the losses were recorded, with the values of the tiny networks there."""
+
+
+class BothEncoder(MomentEncoder):
+    """Two slow features and all moments behind the learnt part, as an encoder then could have."""
+
+    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
+        super().__init__(config, size)
+        self.register_buffer("slow_mean", torch.zeros(24))
+        self.register_buffer("slow_directions", torch.zeros(24, 2))
+
+    @classmethod
+    def width(cls, config: ModelConfig) -> int:
+        """D."""
+        return config.latent_dim + 2 + 24
+
+    def fit(self, frames: Tensor, last: Tensor, seed: int) -> Tensor:
+        """Palette and slow features."""
+        features = super().fit(frames, last, seed)
+        mean, directions = slow_features(features, last, 2)
+        self.slow_mean.copy_(mean)
+        self.slow_directions.copy_(KEPT_SCALE * directions)
+        return features
+
+    def kept(self, newest: Tensor) -> Tensor:
+        """Slow features and moments."""
+        slow = ((newest - self.slow_mean) @ self.slow_directions).clamp(-KEPT_LIMIT, KEPT_LIMIT)
+        return torch.cat([slow, super().kept(newest)], -1)
+
+
+if "golden-both" not in ENCODERS:
+    ENCODERS.add("golden-both", BothEncoder)
+
+
+@contextlib.contextmanager
+def small_sizes(**changes: Any) -> Iterator[None]:
+    """Within, networks have the sizes of the recorded ones; `changes` by the last word of a name of `SMALL_SIZES`."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in SMALL_SIZES.items():
+            patch.setattr(name, changes.get(name.rpartition(".")[2], value))
+        yield
+
+
+ENSEMBLE: dict[str, Any] = {"steps": 2, "members": 3}
+HELD: dict[str, Any] = {"steps": 2, "members": 3, "hold": 5}
+PAIRS: dict[str, Any] = {"steps": UPDATES, "pairs": 8}
 
 PHASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
-    "encoder-pairs": ("encoder", {}, {"encoder_steps": UPDATES}),
-    "encoder-moments": ("encoder", {"moment_colours": 4, "slow_features": 2, "latent_dim": 8}, {"encoder_steps": UPDATES}),
-    "joint-infonce": ("joint", {}, {"joint_steps": UPDATES}),
-    "joint-mse": ("joint", {}, {"joint_steps": UPDATES, "dynamics_loss": "mse"}),
+    "encoder-pairs": ("encoder", {}, {"encoder": PAIRS}),
+    "encoder-moments": ("encoder", {"encoder": "moments", "latent_dim": 6}, {"encoder": PAIRS}),
+    "joint-infonce": ("joint", {}, {"joint": {"steps": UPDATES}}),
+    "joint-mse": ("joint", {}, {"joint": {"steps": UPDATES, "dynamics_loss": "mse"}}),
     "joint-paper": ("joint", {"norm": "batch", "dynamics_residual": False, "critic_bounded": False, "n_global": 1},
-                    {"joint_steps": UPDATES, "whole_windows": False, "window": 3, "value_transitions": 0,
-                     "dynamics_rollouts": 0, "rewarded_share": 0.0, "target_rate": 0.005, "policy_every": 1}),
+                    {"joint": {"steps": UPDATES, "window": 1, "rewarded_share": 0.0}, "target_rate": 0.005,
+                     "policy_every": 1}),
     "joint-many-scenes": ("joint", {}, {
-        "joint_steps": UPDATES, "group_windows": 3, "group_reach": 2, "reconstruction": 0.05, "reconstruction_side": 8,
-        **BEST}),
-    "joint-commands": ("joint", {"command_memory": 0.8, "command_dims": 2}, {"joint_steps": UPDATES}),
-    "latent": ("latent", {}, {"latent_steps": UPDATES, **BEST}),
-    "latent-kept-moments": (
-        "latent", {"moment_colours": 4, "slow_features": 2, "latent_dim": 32, "keep_moments": True},
-        {"encoder_steps": 2, "latent_steps": UPDATES}),
-    "latent-rewarded": ("latent", {}, {"latent_steps": UPDATES, "latent_rewarded_share": 0.3}),
-    "latent-heads-afresh": ("latent", {"command_memory": 0.8}, {"latent_steps": UPDATES, "heads_afresh": True}),
-    "values": ("values", {}, {"latent_value_steps": UPDATES, "latent_rewarded_share": 0.2, **BEST}),
-    "members": ("members", {}, {**TEACHERS, "member_steps": UPDATES, "member_noise": 0.1}),
-    "members-cross-entropy": ("members", {}, {**TEACHERS, "member_steps": UPDATES, **BEST}),
-    "distil": ("distil", {}, TEACHERS),
-    "held": ("held", OWN, {**HOLDERS, "held_steps": UPDATES}),
-    "held_distil": ("held_distil", OWN, HOLDERS),
-    "clone": ("clone", OWN, {"clone_steps": UPDATES}),
-    "clone-candidates": ("clone", OWN, {"clone_steps": UPDATES, "clone_candidates": 2, "clone_reach": 3}),
-    "clone-after-everything": ("clone", OWN, {"encoder_steps": 2, **LATE, "clone_steps": UPDATES}),
+        "joint": {"steps": UPDATES, "reconstruction_side": 8}, "group_windows": 3, "group_reach": 2, **BEST}),
+    "joint-commands": ("joint", {"command_dims": 2}, {"joint": {"steps": UPDATES}}),
+    "latent": ("latent", {}, {"latent": {"steps": UPDATES, "horizon": 3}, **BEST}),
+    "latent-kept-moments": ("latent", {"encoder": "golden-both", "latent_dim": 6}, {
+        "encoder": {**PAIRS, "steps": 2}, "latent": {"steps": UPDATES, "horizon": 3}}),
+    "latent-rewarded": ("latent", {}, {"latent": {"steps": UPDATES, "horizon": 3, "rewarded_share": 0.3}}),
+    "latent-heads-afresh": ("latent", {"command_dims": 3}, {"latent": {"steps": UPDATES, "horizon": 3}}),
+    "values": ("values", {}, {"values": {"steps": UPDATES, "rewarded_share": 0.2}, **BEST}),
+    "members": ("ensemble", {}, {"ensemble": {**ENSEMBLE, "steps": UPDATES, "noise": 0.1}}),
+    "members-cross-entropy": ("ensemble", {}, {"ensemble": {**ENSEMBLE, "steps": UPDATES}, **BEST}),
+    "distil": ("ensemble distil", {}, {"ensemble": ENSEMBLE}),
+    "held": ("held", OWN, {"held": {**HELD, "steps": UPDATES}}),
+    "held_distil": ("held distil", OWN, {"held": HELD}),
+    "clone": ("clone", OWN, {"clone": {"steps": UPDATES}}),
+    "clone-candidates": ("clone", OWN, {"clone": {"steps": UPDATES, "candidates": 2, "reach": 3}}),
+    "clone-after-everything": ("clone", OWN, {
+        "encoder": {**PAIRS, "steps": 2}, "latent": {"steps": 2, "horizon": 3}, "values": {"steps": 2}, "ensemble": ENSEMBLE,
+        "held": HELD, "clone": {"steps": UPDATES, "reach": 3}}),
 }
-"""Cases of the joint training: the phase whose updates are recorded, and the fields of the model and of the training that
-differ from `TINY` and `BRIEF`."""
+"""Cases of the joint training: the stage whose updates are recorded, and the fields of the model and of the training that
+differ from `TINY` and `BRIEF`; with `OWN`, the model has both policies of VELAP's own, whatever the phases."""
+NAMES = {"ensemble/loss": "members/loss", "ensemble/q": "members/q", "ensemble/policy": "members/policy",
+         "ensemble/imitation": "members/imitation", "ensemble/distil": "distil/policy", "ensemble/distil_q": "distil/q",
+         "held/distil": "held_distil/policy"}
+"""Losses that have another name in the golden files."""
 
 
 def tiny_store(side: int = 16, actions: int = 3, episodes: int = 12, length: int = 8) -> FrameStore:
@@ -198,35 +268,49 @@ def tiny_store(side: int = 16, actions: int = 3, episodes: int = 12, length: int
 
 def phase_losses(case: str, folder: Path) -> list[dict[str, float]]:
     """What each of the `UPDATES` updates of a case of `PHASES` says."""
-    phase, model, training = PHASES[case]
-    config = override(Config("test", "default", model=TINY, train=BRIEF), model=model, train=training)
-    run = Trainer(config, tiny_store(), folder, 0, torch.device("cpu"))
-    seen = []
-    while run.step < run.total:
-        info = run.update()
-        if run.phase == phase:
-            seen.append(_plain(info))
-    assert len(seen) == UPDATES, f"{case} had {len(seen)} updates of {phase}"
+    stage, model, training = PHASES[case]
+    own, model = (OWN, {}) if model is OWN else ({}, model)
+    short = 2 if case == "clone-after-everything" else UPDATES
+    with small_sizes(DISTIL_STEPS=short), pytest.MonkeyPatch.context() as patch:
+        config = override(Config("test", "default"), model={**TINY, **model}, train=BRIEF)
+        config = override(config, train=training)
+        if own:
+            train = config.train
+            patch.setattr("velap.training.loop.make_model",
+                          lambda config, spaces: LatentModel(config.model, spaces, train.discount, **own))
+        run = Trainer(config, tiny_store(), folder, 0, torch.device("cpu"))
+        afresh = case == "latent-heads-afresh"  # the encoder alone learnt jointly, without commands
+        if afresh:
+            run.model.command_weight.zero_()
+        seen = []
+        while run.step < run.total:
+            if afresh and run.step == 2:
+                start_heads_afresh(run.run)
+            info = run.update()
+            if run.phase == stage:
+                seen.append(_plain(info))
+    assert len(seen) == UPDATES, f"{case} had {len(seen)} updates of {stage}"
     return seen
 
 
 def head_losses(method: str, folder: Path) -> list[dict[str, float]]:
     """What each of the first `UPDATES` updates of a method's learner says, and last its held-out losses."""
-    config = Config("test", "default", model=TINY, train=BRIEF)
-    run = Trainer(config, tiny_store(), folder, 0, torch.device("cpu"))
-    run.model.eval()
-    folder.mkdir(parents=True, exist_ok=True)
-    data = latent_data(run.model, config, {"seed": "0"}, tiny_store(), folder)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(HEAD_SEEDS[method])
-        head = make_head(method, config.model, run.model.action_dim).train()
-    settings = get_method(method).learner_config("default", {"batch": 16, "steps": 200})
-    learner = get_method(method).learner(head, data, settings, make_generator(HEAD_SEEDS[method], stream=3))
-    return [_plain(learner.update()) for _ in range(UPDATES)] + [learner.report()]
+    with small_sizes():
+        config = override(Config("test", "default"), model=TINY, train=BRIEF)
+        run = Trainer(config, tiny_store(), folder, 0, torch.device("cpu"))
+        run.model.eval()
+        folder.mkdir(parents=True, exist_ok=True)
+        data = latent_data(run.model, config, {"seed": "0"}, tiny_store(), folder)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(HEAD_SEEDS[method])
+            head = make_head(method, config.model, run.model.action_dim).train()
+        settings = get_method(method).learner_config("default", {"batch": 16, "steps": 200})
+        learner = get_method(method).learner(head, data, settings, make_generator(HEAD_SEEDS[method], stream=3))
+        return [_plain(learner.update()) for _ in range(UPDATES)] + [learner.report()]
 
 
 def _plain(info: dict[str, Tensor]) -> dict[str, float]:
-    return {name: float(value) for name, value in info.items()}
+    return {NAMES.get(name, name): float(value) for name, value in info.items()}
 
 
 # Released checkpoints.
@@ -236,8 +320,8 @@ def checkpoint_facts(task: str) -> dict[str, Any]:
     """What a released checkpoint is, as it is loaded: hashes, the whole config, provenance that decides records."""
     model, config, metadata = load_checkpoint(released(task))
     return {
-        "config_hash": config.hash(),
-        "method_hashes": {name: get_method(name).config_hash(config) for name in ALL_METHODS if name not in HEADED},
+        "config_hash": legacy_hash(config),
+        "method_hashes": {name: get_method(name).legacy_hash(config) for name in ALL_METHODS if name not in HEADED},
         "weights_sha256": metadata["weights_sha256"],
         "shared_sha256": shared_weights(metadata),
         "tensors_sha256": tensors_digest(released(task)),
@@ -255,7 +339,7 @@ def checkpoint_facts(task: str) -> dict[str, Any]:
 def hashes_of_content(task: str) -> tuple[str, str]:
     """`weights_sha256` computed anew from the file's tensors and config, and what its metadata says."""
     tensors, metadata = load_tensors(released(task))
-    return content_sha256(tensors, {"config": Config.from_json(metadata["config"]).to_json()}), metadata["weights_sha256"]
+    return content_sha256(tensors, {"config": legacy_json(Config.from_json(metadata["config"]))}), metadata["weights_sha256"]
 
 
 def tensors_digest(path: Path) -> str:
@@ -271,25 +355,11 @@ def todays_config(task: str) -> dict[str, Any]:
     return config_fields(make_config(task, "default"))
 
 
-FORMER: dict[str, dict[str, Any]] = {
-    "model": {"latent_norm": False, "command_scale": 2.0},
-    "train": {"encoder_reach": 20, "encoder_rewarded_share": 0.0, "anneal": False, "shift": 0, "group_goals": 0.5,
-              "latent_batch": 256, "latent_dynamics_steps": 0, "latent_dynamics_batch": 512, "latent_dynamics_horizon": 3,
-              "latent_priority": 0.5, "latent_ridge": 0.1, "latent_value_batch": 512, "held_actions": 5, "held_members": 3,
-              "latent_heads": True},
-    "planner": {"max_neighbours": 16, "rehearsals": 0, "rehearsal_paths": 24, "rehearsal_noise": 0.4, "anchor_factor": 1.0},
-    "controller": {"lookahead_samples": 32},
-}
-"""Fields that have gone since, with the value that the code now acts by; every released checkpoint had exactly these."""
-
-
 def config_fields(config: Config) -> dict[str, Any]:
-    """Every field of a config by its name in the golden files, those at their defaults and those of `FORMER` too."""
-    fields = json.loads(json.dumps(dataclasses.asdict(config)))
-    for part, gone in FORMER.items():
-        assert not gone.keys() & fields[part].keys(), f"some of FORMER's {sorted(gone)} are fields of {part}"
-        fields[part] |= gone
-    return fields
+    """Every field of a config by its name in the golden files, as velap 0.1 had them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("velap.config.migrate_v1._refuse_unless", lambda *_: None)  # sizes are those of the tests
+        return json.loads(json.dumps({"task": config.task, "preset": config.preset, **to_v1(config)}))
 
 
 def record_identities(task: str, method: str) -> set[tuple[str, str]]:
@@ -307,11 +377,18 @@ OLD_STOP = 14
 
 def old_config() -> Config:
     """A tiny run of the task `OLD_TASK` with most phases."""
-    model = {**dataclasses.asdict(TINY), **OWN, "encoder_strides": (4, 2)}
-    training = {**dataclasses.asdict(BRIEF), **LATE, "joint_steps": 4, "clone_steps": 4, "reconstruction": 0.0,
+    training = {"joint": {"steps": 4, "windows": 6, "window": 5, "c1": 0.01}, "latent": {"steps": 2, "horizon": 3},
+                "values": {"steps": 2}, "ensemble": ENSEMBLE, "held": HELD, "clone": {"steps": 4, "reach": 3},
                 "checkpoint_every": 8, "log_every": 2}
-    planner = {"n_iter": 8, "candidates": 4, "n_sim": 2}
-    return override(make_config(OLD_TASK), model=model, train=training, planner=planner)
+    return override(make_config(OLD_TASK), model=TINY, train=training, planner={"n_iter": 8, "candidates": 4, "n_sim": 2})
+
+
+@contextlib.contextmanager
+def old_sizes() -> Iterator[None]:
+    """Within, networks have the sizes of that run, and its config is read although it names them."""
+    with small_sizes(STRIDES=(4, 2), DISTIL_STEPS=2), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("velap.config.migrate_v1._refuse_unless", lambda *_: None)
+        yield
 
 
 def old_store() -> FrameStore:
@@ -333,7 +410,7 @@ def train_old(folder: Path, stop: int | None = None, resume: bool = False) -> Pa
         if stop is not None and progress.step >= stop:
             signal.raise_signal(signal.SIGINT)
 
-    with contextlib.nullcontext() if stop is None else pytest.raises(KeyboardInterrupt):
+    with old_sizes(), contextlib.nullcontext() if stop is None else pytest.raises(KeyboardInterrupt):
         train(old_config(), old_store(), folder, device="cpu", resume=resume, command="velap train SpiralMaze",
               on_progress=interrupt)
     return folder
@@ -357,21 +434,24 @@ def read_tensors(path: Path) -> dict[str, np.ndarray]:
 def train_old_head(checkpoint: Path, method: str) -> Path:
     """Learn a head beside a checkpoint of that run."""
     settings = get_method(method).learner_config("default", {"batch": 16, "steps": 20})
-    return train_head(method, checkpoint, old_store(), device="cpu", config=settings, command="velap train").path
+    with old_sizes():
+        return train_head(method, checkpoint, old_store(), device="cpu", config=settings, command="velap train").path
 
 
 def evaluate_old(checkpoint: Path, records: Path, method: str, episodes: int = 2) -> Path:
     """Validation episodes of a checkpoint of that run; returns the record file."""
-    api.evaluate(OLD_TASK, checkpoint, method=method, episodes=episodes, first_seed=1000, records=records, device="cpu")
+    with old_sizes():
+        api.evaluate(OLD_TASK, checkpoint, method=method, episodes=episodes, first_seed=1000, records=records, device="cpu")
     return record_path(records, OLD_TASK, method, "default", 0)
 
 
 def load_old(checkpoint: Path, method: str) -> tuple[LatentModel, dict[str, Any]]:
     """The model and all fields of the config of a finished old checkpoint; a method with a head has that one beside it."""
-    model, config, metadata = load_checkpoint(checkpoint)
-    if method in HEADED:
-        load_head(checkpoint.with_name(f"{method}.safetensors"), metadata)
-    return model, config_fields(config)
+    with old_sizes():
+        model, config, metadata = load_checkpoint(checkpoint)
+        if method in HEADED:
+            load_head(checkpoint.with_name(f"{method}.safetensors"), metadata)
+        return model, config_fields(config)
 
 
 def read_old_records(path: Path) -> list[dict[str, Any]]:

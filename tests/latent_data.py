@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+import tiny_training  # noqa: F401 - registers the tiny encoder
 from velap.config import Config, ModelConfig
-from velap.config.training import TrainConfig
 from velap.data.frames import FrameStore
-from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.checkpoint import load_checkpoint, save_checkpoint
+from velap.models.velap import LatentModel, Spaces
 from velap.training.frozen import LatentData
 
-SMALL = ModelConfig(
-    frame_stack=1, latent_dim=2, encoder_filters=(4,), encoder_kernels=(4,), encoder_strides=(4,), encoder_dense=(8,),
-    dynamics_dense=(8,), generative_dense=(32, 32), noise_dim=2, policy_dense=(32, 32), critic_dense=(32, 32), bank_size=4)
+SMALL = ModelConfig(encoder="tiny", frame_stack=1, latent_dim=2, bank_size=4)
 
 
 def corridor(length: int = 8, copies: int = 40, seed: int = 0) -> LatentData:
@@ -72,10 +71,9 @@ def noise_store(episodes: int = 20, length: int = 6, successes: int = 2) -> Fram
 
 def joint_checkpoint(path: Path, store: FrameStore, seed: int = 0, preset: str = "default", norm: str = "layer") -> Path:
     """A joint checkpoint with random weights that says it was trained on `store`."""
-    train = TrainConfig(precision="float32", holdout_episodes=2)
-    config = Config("test", preset, model=dataclasses.replace(SMALL, norm=norm), train=train)  # type: ignore[arg-type]
+    config = Config("test", preset, model=dataclasses.replace(SMALL, norm=norm))  # type: ignore[arg-type]
     torch.manual_seed(seed)
-    model = LatentModel(config.model, Spaces(16, 16, (-2.0,) * 3, (2.0,) * 3), train.discount)
+    model = LatentModel(config.model, Spaces(16, 16, (-2.0,) * 3, (2.0,) * 3), config.train.discount)
     save_checkpoint(path, model, config, {"seed": str(seed), "dataset_hash": store.content_hash})
     return path
 

@@ -219,7 +219,7 @@ def round_the_wall(z: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(("horizon", "leads"), [(0, False), (12, False), (40, True)])
 def test_the_policy_of_successes_acts_where_it_gets_to_the_goal_in_time(horizon: int, leads: bool) -> None:
     controller = {"success_rollout": horizon}
-    config = override(toy_config(n_iter=20), model={"success_policy": True}, controller=controller)
+    config = override(toy_config(n_iter=20), train={"clone": {"steps": 1}}, controller=controller)
     agent = VelapAgent(ToyModel(act_success=round_the_wall), config)
     action = agent.act(frames_at(START))
     assert (len(agent.planned_rows) == 0) == leads, "either it acts or a tree is grown"
@@ -229,7 +229,7 @@ def test_the_policy_of_successes_acts_where_it_gets_to_the_goal_in_time(horizon:
 
 
 def test_rows_are_led_by_the_policy_of_successes_each_for_itself() -> None:
-    config = override(toy_config(n_iter=20), model={"success_policy": True}, controller={"success_rollout": 15})
+    config = override(toy_config(n_iter=20), train={"clone": {"steps": 1}}, controller={"success_rollout": 15})
     agent = VelapAgent(ToyModel(act_success=round_the_wall), config)
     agent.act(frames_at(START, (-1.0, 8.0), (9.0, 9.0)))
     assert agent.planned_rows.tolist() == [0], "too far in the first, near enough in the others"
@@ -237,8 +237,8 @@ def test_rows_are_led_by_the_policy_of_successes_each_for_itself() -> None:
 
 
 def test_a_model_without_a_policy_of_successes_is_refused() -> None:
-    config = override(toy_config(), model={"success_policy": True}, controller={"success_rollout": 15})
-    with pytest.raises(ConfigError, match="clone_steps"):
+    config = override(toy_config(), train={"clone": {"steps": 1}}, controller={"success_rollout": 15})
+    with pytest.raises(ConfigError, match="clone"):
         VelapAgent(ToyModel(), config)
 
 

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 import torch
 
+import tiny_training  # noqa: F401 - registers the tiny encoder
 from velap import api
 from velap.config import Config, override
 from velap.errors import CheckpointError, ConfigError, UnknownTaskError
 from velap.methods.base import Agent, get_method, learning_methods, make_agent
 from velap.methods.heads import Head, load_head, make_head, save_head
 from velap.methods.iris import SubgoalHead
-from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.checkpoint import load_checkpoint, save_checkpoint
+from velap.models.velap import LatentModel, Spaces
 from velap.registry import METHODS
 
 LOW, HIGH = np.array([-1.0, 0.0, 2.0], np.float32), np.array([1.0, 4.0, 2.5], np.float32)
@@ -34,12 +36,10 @@ HORIZON = 3
 
 
 def small_config() -> Config:
-    model = {"frame_stack": STACK, "latent_dim": 5, "encoder_filters": (4, 4), "encoder_kernels": (4, 4), "bank_size": 0,
-             "encoder_strides": (2, 2), "encoder_dense": (8,), "dynamics_dense": (16, 16), "generative_dense": (16,),
-             "noise_dim": 2, "policy_dense": (16,), "critic_dense": (16, 16)}
+    model = {"encoder": "tiny", "frame_stack": STACK, "latent_dim": 5, "bank_size": 0}
     base = Config(task="toy", preset="default")
-    return override(base, model=model, controller={"n_replan": 4, "residuals": 3}, train={"precision": "float32"},
-                    planner={"n_iter": 12, "candidates": 4, "n_sim": 2, "discard_std": 10.0, "discard_low_exponent": 1e4,
+    return override(base, model=model, controller={"n_replan": 4, "residuals": 3},
+                    planner={"n_iter": 12, "candidates": 4, "n_sim": 2, "discard_low_exponent": 1e4,
                              "discard_high_exponent": 1e-6})
 
 
@@ -195,11 +195,11 @@ def test_the_config_hash_covers_all_that_decides_the_method(checkpoint: Path, me
     others = {get_method(other).config_hash(config, head_of(checkpoint, other)) for other in METHODS if other != method}
     assert own not in others
     assert (own == config.hash()) == (method == "velap")
-    planner, model = {"planner": {"n_iter": 7}}, {"model": {"success_policy": True}, "controller": {"success_rollout": 9}}
-    for changes in (planner, model):
+    planner, clone = {"planner": {"n_iter": 7}}, {"train": {"clone": {"steps": 9}}, "controller": {"success_rollout": 9}}
+    for changes in (planner, clone):
         changed = kind.config_hash(override(config, **changes), head)
         assert (own != changed) == (method == "velap"), "what the tree and its controller alone act by"
-    assert own != kind.config_hash(override(config, train={"c0": 7.0}), head)
+    assert own != kind.config_hash(override(config, model={"n_global": 3}), head)
     assert own == kind.config_hash(config, head, kind.settings_of("default"))
     paper = dataclasses.replace(config, preset="paper")
     assert kind.config_hash(paper, head) == kind.config_hash(paper, head, kind.settings_of("paper"))

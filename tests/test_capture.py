@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from test_joint import CLONED, config, make_store
+from tiny_training import config, make, make_store, to_end
 from velap.training.capture import adam, set_rate
-from velap.training.joint import JointLearner
 from velap.training.loop import Trainer
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
@@ -27,28 +26,25 @@ def test_a_new_rate_counts_at_the_next_step(device: str) -> None:
     torch.testing.assert_close(weight.detach().cpu(), torch.full((3,), -0.125))
 
 
-def test_on_a_cpu_nothing_is_captured(tmp_path) -> None:
-    run = Trainer(config(CLONED), make_store(), tmp_path, 0, torch.device("cpu"))
-    while run.step < run.total:
-        run.update()
-    assert run.learner._captured == {}
+def test_on_a_cpu_nothing_is_captured(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("velap.training.phase.Captured", None)
+    to_end(make(tmp_path, config(clone={"steps": 2})))
 
 
 @needs_cuda
-def test_replays_learn_what_plain_updates_do(tmp_path, monkeypatch) -> None:
-    def trained(name: str) -> dict[str, torch.Tensor]:
-        settings = config(CLONED, encoder_steps=20, joint_steps=20, latent_steps=20, latent_value_steps=20, clone_steps=20,
-                          policy_every=2, precision="float32")
-        run = Trainer(settings, make_store(), tmp_path / name, 0, torch.device("cuda"))
+def test_replays_learn_what_plain_updates_do(tmp_path) -> None:
+    phases = {label: {"steps": 20} for label in ("encoder", "joint", "latent", "values", "clone")}
+
+    def trained(name: str, graphs: bool) -> dict[str, torch.Tensor]:
+        run = Trainer(config(policy_every=2, **phases), make_store(), tmp_path / name, 0, torch.device("cuda"))
+        run.run.graphs = graphs
         while run.step < run.total:
             info = run.update()
             assert all(torch.isfinite(value).all() for value in info.values())
         return {name: value.cpu() for name, value in run.model.state_dict().items()}
 
-    replayed = trained("replayed")
-    monkeypatch.setattr(JointLearner, "_run", lambda self, name, update, capture=True: update())
-    plain = trained("plain")
-    start = Trainer(config(CLONED), make_store(), tmp_path / "start", 0, torch.device("cuda")).model.state_dict()
+    replayed, plain = trained("replayed", True), trained("plain", False)
+    start = Trainer(config(**phases), make_store(), tmp_path / "start", 0, torch.device("cuda")).model.state_dict()
     for name in ("encoder.dense.0.weight", "dynamics.0.weight", "global_policy.0.weight", "success_policy.0.weight"):
         moved = (plain[name] - start[name].cpu()).norm()
         assert moved > 0

@@ -18,10 +18,12 @@ import torch
 import velap
 from velap import cli
 from velap.cli.settings import parse_settings
-from velap.config import override
+from velap.config import describe, override
 from velap.errors import ConfigError
 from velap.evaluation.records import read_records
-from velap.models.velap import LatentModel, Spaces, save_checkpoint
+from velap.methods.base import get_method
+from velap.models.checkpoint import save_checkpoint
+from velap.models.velap import LatentModel, Spaces
 from velap.tasks import TASKS, make_config
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -61,7 +63,7 @@ def untrained(path: Path, task: str = "SpiralMaze", side: int = 64, bound: float
     (["train", "--dataset", "robot/pile-v0"], "no Minari dataset 'robot/pile-v0'"),
     (["train", "SpiralMaze", "--set", "n_iter=3"], "expected PART.FIELD=VALUE"),
     (["train", "SpiralMaze", "--set", "train.nothing=3"], "no field ['nothing']"),
-    (["train", "SpiralMaze", "--set", "train.window=x"], "'x' for train.window; expected int"),
+    (["train", "SpiralMaze", "--set", "train.joint.window=x"], "`train.joint.window` is 'x'; expected int"),
     (["evaluate", "SpiralMaze", "--method", "ppo"], "unknown method 'ppo'; expected one of bc, "),
     (["table"], "no records below"),
     (["table", "--records", "x", "--write", "README.md"], "no records below"),
@@ -97,11 +99,26 @@ def test_ctrl_c_exits_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 
 def test_settings_take_the_type_of_their_field() -> None:
-    settings = ["planner.n_iter=500", "train.c1=1", "planner.anchor=snap", "planner.discard_low_exponent=20.0"]
-    assert parse_settings([settings]) == {
-        "planner": {"n_iter": 500, "anchor": "snap", "discard_low_exponent": 20.0}, "train": {"c1": 1.0}}
-    with pytest.raises(ConfigError, match=r"2\.5 for planner.n_iter; expected int, such as 250"):
-        parse_settings([["planner.n_iter=2.5"]])
+    settings = ["planner.n_iter=500", "train.joint.c1=1", "planner.anchor=snap", "planner.discard_low_exponent=null"]
+    changes = parse_settings([settings])
+    assert changes == {"planner": {"n_iter": 500, "anchor": "snap", "discard_low_exponent": None},
+                       "train": {"joint": {"c1": 1}}}
+    assert override(make_config("SpiralMaze"), **changes).train.phases[0].c1 == 1.0
+    own = {"velap": get_method("velap").settings}
+    assert parse_settings([["velap.planner=mine"]], own) == {"velap": {"planner": "mine"}}
+    with pytest.raises(ConfigError, match=r"velap\.planner` is 3; expected str"):
+        parse_settings([["velap.planner=3"]], own)
+    for wrong in ("planner.n_iter", "planner=3", "train.joint.steps.more=3", "planner.deep.n_iter=3", "plans.n_iter=3"):
+        with pytest.raises(ConfigError, match=r"expected PART\.FIELD=VALUE"):
+            parse_settings([[wrong]])
+
+
+def test_the_config_command_prints_every_field(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["config", "SpiralMaze"]) == 0
+    said = capsys.readouterr().out
+    for name, *_ in describe(make_config("SpiralMaze")):
+        assert name in said
+    assert "planner.discard_low_exponent = 20.0  (float or null)" in said and "train.clone.steps = -  (int)" in said
 
 
 def test_every_set_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,9 +129,9 @@ def test_every_set_counts(monkeypatch: pytest.MonkeyPatch) -> None:
         seen.append(parse_settings(settings))
 
     monkeypatch.setitem(cli.COMMANDS, "info", taken)
-    assert cli.main(["info", "--set", "train.c1=1", "train.c3=2", "--set", "planner.n_sim=3"]) == 0
+    assert cli.main(["info", "--set", "train.c0=1", "train.c3=2", "--set", "planner.n_sim=3"]) == 0
     assert cli.main(["info"]) == 0
-    assert seen == [{"train": {"c1": 1.0, "c3": 2.0}, "planner": {"n_sim": 3}}, {}]
+    assert seen == [{"train": {"c0": 1, "c3": 2}, "planner": {"n_sim": 3}}, {}]
 
 
 def test_an_evaluation_goes_on_where_it_stopped(capsys: pytest.CaptureFixture[str]) -> None:
@@ -363,11 +380,10 @@ def small_spiral(monkeypatch: pytest.MonkeyPatch) -> None:
     """SpiralMaze with little data, little training and a planner that is quick."""
     task = TASKS["SpiralMaze"]
     small: dict[str, dict[str, Any]] = {
-        "train": {"joint_steps": 4, "latent_steps": 4, "batch_windows": 4, "log_every": 2,
-                  "diagnose_every": 4, "holdout_episodes": 2},
+        "train": {"joint": {"steps": 4, "windows": 4}, "latent": {"steps": 4}, "log_every": 2},
         "planner": {"n_iter": 10, "candidates": 5}, "model": {"bank_size": 32}}
     recipe = dataclasses.replace(task.recipe, trajectories=120)
-    monkeypatch.setitem(TASKS, "SpiralMaze", dataclasses.replace(task, recipe=recipe, default_overrides=small))
+    monkeypatch.setitem(TASKS, "SpiralMaze", dataclasses.replace(task, recipe=recipe, overrides=small))
 
 
 @pytest.mark.usefixtures("small_spiral")

@@ -8,9 +8,12 @@ import pytest
 import torch
 from torch import tensor
 
-from test_joint import CLONED, config, make_store
+from tiny_training import SMALL, config, make, make_store, moved, straight_and_resumed, to_end, until, weights
+from velap.config import Config
+from velap.errors import DatasetError
 from velap.models.arrivals import arrivals
-from velap.training.clones import Clones, arrival_rate, fresh
+from velap.models.checkpoint import load_checkpoint
+from velap.training.clone import Best, arrival_rate, fresh
 from velap.training.loop import Trainer
 
 GOAL = 0.9
@@ -47,75 +50,85 @@ class Line:
 
 
 def test_the_clone_that_arrives_from_more_of_the_far_states_is_kept() -> None:
-    cache, rows, generator = torch.linspace(-2, 1, 400).unsqueeze(1), torch.arange(400), torch.Generator().manual_seed(0)
+    states = torch.linspace(-2, 1, 400).unsqueeze(1)
     slow, fast, away = Line(0.3), Line(0.6), Line(-1.0)
     # the farther half lies between -2 and -0.5; 150 steps are 1.69 at 2.5 times 0.3, and 2.25 at most
-    assert arrival_rate(away, cache) == 0
-    assert 0 < arrival_rate(slow, cache) < arrival_rate(fast, cache) < 1
-    clones = Clones(away.success_policy)
-    for model in (slow, fast, away):
-        clones.judge(model, cache, rows, generator)
-    assert torch.equal(clones.best.bias, fast.success_policy.bias)
-    assert float(clones.rate) == pytest.approx(arrival_rate(fast, cache), abs=0.05)
+    rates = [arrival_rate(model, model.success_policy, states) for model in (slow, fast, away)]
+    assert rates[2] == 0 < rates[0] < rates[1] < 1
+    best = Best(away.success_policy)
+    for model, rate in zip((slow, fast, away), rates, strict=True):
+        best.keep(model.success_policy, rate)
+    assert torch.equal(best.policy.bias, fast.success_policy.bias) and float(best.rate) == pytest.approx(rates[1])
 
 
-def make(tmp_path, name: str, **changes) -> Trainer:
-    return Trainer(config(CLONED, clone_steps=9, clone_candidates=3, **changes), make_store(), tmp_path / name, 0,
-                   torch.device("cpu"))
-
-
-def until_clones(run: Trainer) -> Trainer:
-    while run.total - run.step > 9:
-        run.update()
-    return run
+def cloning(steps: int = 9, candidates: int = 3, **clone) -> Config:
+    return config(SMALL, clone={"steps": steps, "candidates": candidates, **clone})
 
 
 def test_every_candidate_begins_anew_and_the_best_one_ends_in_the_model(tmp_path, monkeypatch) -> None:
     rates, kept, begun = iter([0.2, 0.7, 0.5]), [], []
-    monkeypatch.setattr("velap.training.clones.arrival_rate", lambda model, states: next(rates))
-    run = until_clones(make(tmp_path, "a"))
+    monkeypatch.setattr("velap.training.clone.arrival_rate", lambda model, policy, states: next(rates))
+    run = make(tmp_path, cloning())
+    while run.total - run.step > 9:
+        run.update()
     for step in range(9):
         info = run.update()
-        state = {k: v.clone() for k, v in run.model.success_policy.state_dict().items()}
+        state = weights(run.model.success_policy)
         if step % 3 == 0:
             begun.append(state["0.weight"])
-            assert len(run.learner.cloning.optimizer.state) and run.learner.cloning.optimizer.param_groups[0]["lr"] == 1e-3
-            moments = next(iter(run.learner.cloning.optimizer.state.values()))
-            assert float(moments["step"]) == 1, "an optimiser of its own"
+            optimizer = run.learner.optimizers["clone"]
+            assert optimizer.param_groups[0]["lr"] == 1e-3
+            assert float(next(iter(optimizer.state.values()))["step"]) == 1, "an optimiser of its own"
         assert ("clone/arrival_rate" in info) == (step % 3 == 2)
         if step % 3 == 2:
             kept.append(state)
-    assert not torch.allclose(begun[0], begun[1], atol=0.05), "weights of their own"
+    assert not torch.allclose(begun[0], begun[1], atol=0.02), "weights of their own"
     final = run.model.success_policy.state_dict()
-    assert all(torch.equal(final[k], run.learner.cloning.candidates.best.state_dict()[k]) for k in final)
     # at the last update the model already holds the winner again: the second
     assert all(torch.equal(final[k], kept[1][k]) for k in final)
 
 
-@pytest.mark.parametrize("left", [8, 4, 2])
-def test_a_resume_between_and_within_candidates_goes_on_to_the_same_bits(tmp_path, left: int) -> None:
-    straight, broken = until_clones(make(tmp_path, "a")), make(tmp_path, "b")
-    while straight.step < straight.total:
-        straight.update()
-    while broken.total - broken.step > left:
-        broken.update()
-    broken.save()
-    again = make(tmp_path, "b")
-    again.resume()
-    while again.step < again.total:
-        again.update()
-    expected = straight.model.state_dict()
-    assert all(torch.equal(v, expected[k]) for k, v in again.model.state_dict().items())
-    assert torch.equal(again.learner.cloning.candidates.rate, straight.learner.cloning.candidates.rate)
+@pytest.mark.parametrize("done", [1, 5, 7])
+def test_a_resume_between_and_within_candidates_goes_on_to_the_same_bits(tmp_path, done: int) -> None:
+    straight_and_resumed(tmp_path, cloning(), 12 + done)
+
+
+def test_the_clone_phase_moves_the_policy_of_successes_alone_towards_their_actions(tmp_path) -> None:
+    run = make(tmp_path, cloning(200, 1))
+    while run.total - run.step > 200:
+        run.update()
+    before = weights(run.model)
+    first, learner = float(run.update()["clone/loss"]), run.learner
+    while run.step < run.total:
+        last = float(run.update()["clone/loss"])
+    assert moved(before, run.model) == {"success_policy"}
+    # two successful episodes of six steps in the store, none held out
+    assert run.sampler.episodes[run.sampler.rank_of_row[learner.rows]].unique().tolist() == [0, 1]
+    assert len(learner.rows) == 12 and last < 0.7 * first, "noise, learnt by heart"
+    loaded, _, _ = load_checkpoint(run.finish("x").checkpoint)
+    assert loaded.search_fns()["act_success"](torch.zeros(2, SMALL.latent_dim)).shape == (2, 3)
+
+
+def test_the_end_of_successes_is_cloned(tmp_path) -> None:
+    sampler = make(tmp_path, config()).sampler
+    assert sampler.rewarded.tolist() == [5, 12]
+    assert sampler.successes(2).tolist() == [3, 4, 5, 10, 11, 12]
+    assert sampler.successes(50).tolist() == sampler.successes().tolist() == [*range(6), *range(7, 13)]
+    run = make(tmp_path, cloning(2, 1, reach=2))
+    assert until(run, "clone").rows.tolist() == [3, 4, 5, 10, 11, 12]
+
+
+def test_nothing_to_clone_is_an_error_before_the_first_update(tmp_path) -> None:
+    store = make_store()
+    store = dataclasses.replace(store, rewards=store.rewards * 0)
+    with pytest.raises(DatasetError, match="no successful episode"):
+        Trainer(cloning(), store, tmp_path, 0, torch.device("cpu"))
 
 
 def test_one_candidate_keeps_the_weights_it_has(tmp_path) -> None:
-    run = Trainer(config(CLONED, clone_steps=1), make_store(), tmp_path, 0, torch.device("cpu"))
+    run = make(tmp_path, cloning(1, 1))
     before = run.model.success_policy[0].weight.clone()
-    assert run.learner.cloning.candidates is None
-    while run.step < run.total:
-        info = run.update()
-    assert "clone/arrival_rate" not in info
+    to_end(run)
     assert (run.model.success_policy[0].weight - before).abs().max() < 2e-3
 
 
@@ -128,10 +141,3 @@ def test_fresh_weights_come_from_the_generator_alone() -> None:
     fresh(first, torch.Generator().manual_seed(5))
     assert torch.equal(torch.get_rng_state(), state)
     assert not torch.equal(first.weight, second.weight)
-
-
-def test_settings_of_the_clone_do_not_touch_what_methods_share() -> None:
-    plain = config(CLONED, clone_steps=9)
-    other = dataclasses.replace(plain, train=dataclasses.replace(plain.train, clone_candidates=3))
-    assert plain.shared_json() == other.shared_json()
-    assert plain.hash() != other.hash()

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from test_joint import SMALL, config, make_store, straight_and_resumed
+from tiny_training import SMALL, config, make, make_store
 from velap.config import ModelConfig
 from velap.data.commands import past_commands
 from velap.data.sampling import WindowSampler
 from velap.errors import ConfigError
 from velap.methods.base import get_method, make_agent
 from velap.methods.states import StateEncoder
-from velap.models.velap import COMMAND_SCALE, LatentModel, Spaces
+from velap.models.encoders.base import latent_width
+from velap.models.velap import COMMAND_MEMORY, COMMAND_SCALE, LatentModel, Spaces
 from velap.registry import METHODS
-from velap.training.latents import encode_all
-from velap.training.loop import Trainer
-from velap.training.pairs import Pairs
+from velap.training.encoder import actions_before
+from velap.training.encoding import encode_all
 
-MEMORY = 0.75
-REMEMBERING = dataclasses.replace(SMALL, command_memory=MEMORY)
+MEMORY = COMMAND_MEMORY
+REMEMBERING = dataclasses.replace(SMALL, command_dims=3)
 
 
 def make_model(settings: ModelConfig = REMEMBERING) -> LatentModel:
@@ -100,12 +100,14 @@ def test_every_method_sees_its_own_past_actions(method):
 
 
 def test_the_contrastive_loss_does_not_learn_what_commands_tell(tmp_path: Path):
-    run = Trainer(config(REMEMBERING, dynamics_horizon=1), make_store(), tmp_path, 0, torch.device("cpu"))
-    last = run.model.dynamics[-1].weight
-    before = last.detach().clone()
+    run = make(tmp_path, config(REMEMBERING))
     run.update()
-    changed = (last.detach() - before).abs().amax(1) > 0
-    assert changed[:4].all() and not changed[4:].any()
+    batch = run.sampler.sample(run.learner.draw, run.run.generator, 0.0)
+    latents = torch.randn(len(batch.rows), 7, requires_grad=True)
+    loss, _ = run.learner.dynamics_loss(latents, batch)
+    told = latents.detach().clone()
+    told[batch.unroll_at.max() + 3 :, 4:] += 5  # commands of frames that nothing is unrolled from
+    assert torch.equal(run.learner.dynamics_loss(told, batch)[0], loss.detach())
 
 
 def test_latents_without_memory_are_what_the_encoder_says():
@@ -113,45 +115,16 @@ def test_latents_without_memory_are_what_the_encoder_says():
     torch.testing.assert_close(model.encode(frames, torch.ones(2, 3)), model.encoder(frames))
 
 
-@pytest.mark.parametrize(
-    "changes", [{"command_memory": 1.0}, {"command_memory": -0.1}, {"command_dims": -1}]
-)
-def test_a_memory_without_sense_is_refused(changes):
-    with pytest.raises(ConfigError, match=next(iter(changes))):
-        ModelConfig(**changes)
-
-
-def test_heads_afresh_learn_with_commands_and_the_encoder_without(tmp_path: Path):
-    settings = config(REMEMBERING, heads_afresh=True, joint_steps=2, latent_steps=2)
-    run = Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
-    model, sampler = run.model, run.sampler
-    for _ in range(2):
-        run.update()
-    assert not encode_all(model, sampler)[:, -3:].any()
-    before = {name: value.clone() for name, value in model.state_dict().items()}
-    run.update()
-    latents = encode_all(model, sampler)
-    torch.testing.assert_close(latents[:, -3:], COMMAND_SCALE * sampler.commands(torch.arange(len(latents)), MEMORY))
-    for name, value in model.named_parameters():
-        if name.startswith("encoder."):
-            assert torch.equal(value, before[name]), name
-        elif name.endswith("0.weight"):  # new weights are as far from the old ones as they are large
-            assert (value - before[name]).norm() > 0.5 * before[name].norm(), name
-    learnt = run.learner.local_target.weights[0] - model.local_critics.weights[0]
-    assert learnt.norm() < 0.5 * model.local_critics.weights[0].norm()
-
-
-@pytest.mark.parametrize("stop", [1, 2, 3])
-def test_a_training_with_heads_afresh_resumes_to_the_same_bits(tmp_path: Path, stop: int):
-    settings = config(REMEMBERING, heads_afresh=True, joint_steps=2, latent_steps=3)
-    straight_and_resumed(tmp_path, settings, stop)
+def test_a_memory_without_sense_is_refused():
+    with pytest.raises(ConfigError, match="command_dims"):
+        ModelConfig(command_dims=-1)
 
 
 def test_the_first_actions_alone_are_remembered():
     model = make_model(dataclasses.replace(REMEMBERING, command_dims=2))
     sampler = WindowSampler(make_store(), config().train, 2, torch.device("cpu"), np.zeros(0, np.int64))
     latents = encode_all(model, sampler)
-    assert latents.shape[1] == REMEMBERING.latent_dim + 2 == model.config.width(3)
+    assert latents.shape[1] == REMEMBERING.latent_dim + 2 == latent_width(model.config, 3)
     expected = COMMAND_SCALE * sampler.commands(torch.arange(len(latents)), MEMORY)[:, :2]
     torch.testing.assert_close(latents[:, -2:], expected)
     states = StateEncoder(model)
@@ -163,11 +136,11 @@ def test_the_first_actions_alone_are_remembered():
 
 def test_the_inverse_model_tells_how_far_a_lagging_hand_went():
     sampler = WindowSampler(make_store(), config().train, 2, torch.device("cpu"), np.zeros(0, np.int64))
-    told = Pairs(make_model(), config().train, sampler, torch.Generator()).before
+    told = actions_before(make_model(), sampler)
     row, mean, way = 3, torch.zeros(3), torch.zeros(3)
     for action in sampler.actions[:row]:
         mean = MEMORY * mean + (1 - MEMORY) * action
         way = way + mean
     torch.testing.assert_close(told[row], way.double())
-    plain = Pairs(make_model(SMALL), config().train, sampler, torch.Generator()).before
+    plain = actions_before(make_model(SMALL), sampler)
     torch.testing.assert_close(plain[row], sampler.actions[:row].double().sum(0))

@@ -13,7 +13,8 @@ from velap.evaluation.records import read_records
 from velap.methods.base import learning_methods
 from velap.methods.heads import make_head, save_head
 from velap.methods.iris import SubgoalHead
-from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.checkpoint import load_checkpoint, save_checkpoint
+from velap.models.velap import LatentModel, Spaces
 from velap.tasks import make_config
 
 QUICK = ("samples=8", "horizon=6", "elites=2", "iterations=1")

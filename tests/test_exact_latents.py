@@ -10,6 +10,7 @@ from rich.console import Console
 
 import velap.envs  # noqa: F401 - registers the tasks
 from studies.exact_latents import ExactEncoder, collect_states, pack, study_exact_latents, unpack
+from velap.config import ModelConfig
 from velap.data.behaviours import position_of, run_trajectory
 from velap.data.frames import stack_indices
 from velap.errors import ConfigError
@@ -18,8 +19,10 @@ from velap.tasks import get_task
 
 def test_states_survive_their_pictures():
     states = np.random.default_rng(0).normal(size=(2, 3, 9)).astype(np.float32)
-    pictures = np.stack([np.stack([pack(state) for state in row]) for row in states])
-    assert pictures.shape == (2, 3, 64, 64, 3) and np.array_equal(unpack(pictures, 9), states)
+    for shape in ((64, 64, 3), (1, 13, 3)):
+        pictures = np.stack([np.stack([pack(state, 4, shape) for state in row]) for row in states])
+        found, joints = unpack(pictures)
+        assert pictures.shape == (2, 3, *shape) and np.array_equal(found, states) and joints == 4
 
 
 @pytest.mark.parametrize("name", ["WindowClose", "FaucetClose", "ButtonWall", "DrawerButton"])
@@ -28,25 +31,27 @@ def test_states_are_those_of_the_recorded_trajectories(name):
     data = collect_states(task, contexts=1)
     env = gym.make(task.env_id).unwrapped
     recorded = run_trajectory(env, task.recipe, task.shares, 0, 0, 1)
-    start, length = data.store.episode_start[1], data.store.episode_length[1]
+    start, length = data.episode_start[1], data.episode_length[1]
     rows = slice(start, start + length + 1)
-    assert np.array_equal(recorded["actions"], data.store.actions[rows]), "drawing must not change what happens"
-    assert np.allclose(recorded["positions"], data.states[rows, :3])
+    assert np.array_equal(recorded["actions"], data.actions[rows]), "drawing must not change what happens"
+    assert np.allclose(recorded["positions"], unpack(data.frames[rows])[0][:, :3])
     assert np.allclose(env.true_state()[:3], position_of(env))
 
 
 def test_data_and_episodes_are_encoded_alike():
     data = collect_states(get_task("DrawerButton"), contexts=1)
-    encode = ExactEncoder(data, 32)
-    rows = stack_indices(np.arange(len(data.states)), data.store.first, 3)
-    of_data = encode(torch.from_numpy(data.store.frames[rows]))
-    packed = np.stack([[pack(state) for state in stack] for stack in data.states[rows[:50]]])
-    assert torch.allclose(of_data[:50], encode(torch.from_numpy(packed)))
-    assert of_data.shape == (len(data.states), 32) and (of_data[:, 16:] == 0).all()
-    moved = (data.states[2, :3] - data.states[1, :3]) / 0.008
+    states, joints = unpack(data.frames)
+    encoder = ExactEncoder(ModelConfig(latent_dim=32), (64, 64))
+    features = encoder.fit(torch.from_numpy(data.frames), torch.from_numpy(data.last), 0)
+    rows = stack_indices(np.arange(len(states)), data.first, 3)
+    of_data = encoder.encode(features[torch.from_numpy(rows)])
+    packed = np.stack([[pack(state, joints) for state in stack] for stack in states[rows[:50]]])
+    assert torch.allclose(of_data[:50], encoder(torch.from_numpy(packed)))
+    assert of_data.shape == (len(states), 32) and (of_data[:, 16:] == 0).all()
+    moved = (states[2, :3] - states[1, :3]) / 0.008
     assert np.allclose(of_data[2, 10:13].numpy(), moved, atol=1e-4)
     with pytest.raises(ConfigError, match="latent_dim"):
-        ExactEncoder(data, 8)
+        ExactEncoder(ModelConfig(latent_dim=8), (64, 64)).fit(torch.from_numpy(data.frames), torch.from_numpy(data.last), 0)
 
 
 def test_mazes_tell_no_state():
@@ -55,12 +60,12 @@ def test_mazes_tell_no_state():
 
 
 @pytest.mark.parametrize("task", ["WindowClose", "DrawerButton"])
-def test_the_study_learns_and_plays(tmp_path, task):
-    quick = {"model": {"bank_size": 10, "success_policy": False, "held_policy": True}, "planner": {"n_iter": 20},
-             "train": {"latent_steps": 2, "latent_value_steps": 2, "clone_steps": 0,
-                       "member_steps": 2, "members": 2, "held_steps": 2, "distil_steps": 2,
-                       "latent_horizon": 3},
+def test_the_study_learns_and_plays(tmp_path, monkeypatch, task):
+    quick = {"model": {"bank_size": 10}, "planner": {"n_iter": 20},
+             "train": {"latent": {"steps": 2, "horizon": 3}, "values": {"steps": 2}, "clone": {"steps": 0},
+                       "ensemble": {"steps": 2, "members": 2}, "held": {"steps": 2, "members": 2}},
              "controller": {"success_rollout": 0, "success_exponent": 0.0}}
+    monkeypatch.setattr("velap.config.training.DISTIL_STEPS", 2)
     rows = study_exact_latents(Console(quiet=True), task, quick, quick=True, path=tmp_path / "x.json", contexts=3)
     assert [row["method"] for row in rows] == ["td3bc", "velap"] and {row["episodes"] for row in rows} == {10}
     assert json.loads((tmp_path / "x.json").read_text()) == rows

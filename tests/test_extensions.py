@@ -23,9 +23,8 @@ from velap.runs import load_tensors
 from velap.tasks import get_task
 
 EXTENSIONS = Path(__file__).with_name("extensions")
-QUICK = ["train.joint_steps=3", "train.latent_steps=3", "train.batch_windows=4", "train.window=5", "model.frame_stack=1",
-         "train.precision=float32", "train.log_every=1", "model.encoder_kernels=(8,)", "model.encoder_strides=(8,)",
-         "model.encoder_filters=(4,)", "planner.n_iter=20", "model.bank_size=20"]
+QUICK = ["train.joint.steps=3", "train.latent.steps=3", "train.joint.windows=4", "train.joint.window=5",
+         "model.frame_stack=1", "train.log_every=1", "planner.n_iter=20", "model.bank_size=20"]
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from velap.config import Norm
 from velap.models.networks import MLP, EnsembleMLP
 from velap.native.folded import folded_ensemble, folded_mlp
 
-NORMS: tuple[Norm, ...] = ("batch", "layer", "none")
+NORMS: tuple[Norm, ...] = ("batch", "layer")
 
 
 def unlike_the_start(network: nn.Module) -> nn.Module:

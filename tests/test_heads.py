@@ -216,21 +216,20 @@ def test_a_loss_that_is_not_a_number_stops_the_training(checkpoint: Path, method
 
 def test_the_command_line_trains_a_head_beside_the_joint_checkpoint(
         checkpoint: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("velap.data.frames.load_store", lambda *args, **kwargs: STORE)
-    monkeypatch.setattr(cli, "ERR", cli.Console(stderr=True, highlight=False, width=200))
+    monkeypatch.setattr("velap.data.loading.load_store", lambda *args, **kwargs: STORE)
     folder = str(checkpoint.parent)
     command = ["train", "--dataset", "test", "--out", folder, "--method", "iql", "--set", "head.steps=3"]
     assert cli.main(command) == 0
     out = capsys.readouterr().out
-    assert "learning iql: 3 of 3" in out
+    assert "training, iql: 3 of 3" in out
     assert "iql.safetensors: 3 updates in" in out
     assert "held_out/value" in out
     assert cli.main([*command, "head.nothing=1"]) == 2
     assert "no field ['nothing']" in capsys.readouterr().err
     assert cli.main([*command, "--seed", "4"]) == 2
     assert "task, preset and seed ('test', 'default', 0); expected ('test', 'default', 4)" in capsys.readouterr().err
-    assert cli.main([*command, "train.c1=0.5"]) == 2
-    assert "trained with other values of some of train.c1" in capsys.readouterr().err
+    assert cli.main([*command, "train.joint.c1=0.5"]) == 2
+    assert "trained with other values of some of train.joint" in capsys.readouterr().err
     assert cli.main(["train", "--dataset", "test", "--out", folder, "--method", "mppi"]) == 0, "nothing more to learn"
     assert cli.main(["train", "SpiralMaze", "--method", "random"]) == 2
     assert "'random': it has nothing to learn" in capsys.readouterr().err
@@ -240,15 +239,14 @@ def test_the_command_line_trains_a_head_beside_the_joint_checkpoint(
 
 def test_the_joint_training_comes_first_where_it_is_missing(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("velap.data.frames.load_store", lambda *args, **kwargs: STORE)
-    quick = ["train.joint_steps=2", "train.latent_steps=2", "train.batch_windows=2", "train.window=5",
-             "train.precision=float32", "model.frame_stack=1", "head.steps=2", "train.log_every=1",
-             "model.encoder_kernels=(4,)", "model.encoder_strides=(4,)", "model.encoder_filters=(4,)"]
+    monkeypatch.setattr("velap.data.loading.load_store", lambda *args, **kwargs: STORE)
+    quick = ["train.joint.steps=2", "train.latent.steps=2", "train.joint.windows=2", "train.joint.window=5",
+             "model.encoder=tiny", "model.frame_stack=1", "head.steps=2", "train.log_every=1"]
     folder = tmp_path / "run"
     assert cli.main(["train", "--dataset", "test", "--out", str(folder), "--method", "iris", "--set", *quick]) == 0
     captured = capsys.readouterr()
     assert f"note: no joint checkpoint in {folder}; it is trained first" in captured.err
-    assert "training, latent phase: 4 of 4" in captured.out
-    assert "learning iris: 2 of 2" in captured.out
+    assert "training, latent: 4 of 4" in captured.out
+    assert "training, iris: 2 of 2" in captured.out
     assert (folder / "model.safetensors").exists()
     assert (folder / "iris.safetensors").exists()

@@ -23,6 +23,13 @@ from velap.methods.iql import (
 from velap.runs import make_generator
 from velap.training.frozen import LatentData
 
+
+@pytest.fixture(autouse=True)
+def small_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks that learn little data in few updates."""
+    for name, value in {"velap.methods.iql.CRITIC": (32, 32), "velap.methods.heads.POLICY": (32, 32)}.items():
+        monkeypatch.setattr(name, value)
+
 ROWS = torch.tensor([0, 1, 2, 3])
 
 
@@ -43,7 +50,10 @@ def test_advantage_weights_by_hand_and_their_clip() -> None:
 def linear_learner(**changes: object) -> tuple[IQLLearner, dict[str, np.ndarray]]:
     """A learner whose networks are linear, and their weights; the target critics differ from the critics."""
     data = small_data()
-    head = IQLHead(dataclasses.replace(SMALL, policy_dense=(), critic_dense=()), 1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("velap.methods.heads.POLICY", ())
+        patch.setattr("velap.methods.iql.CRITIC", ())
+        head = IQLHead(SMALL, 1)
     config = dataclasses.replace(IQLConfig(batch=4, rewarded_share=0.0), **changes)
     learner = IQLLearner(head, data, config, make_generator(0))
     rng = np.random.default_rng(7)

@@ -21,6 +21,13 @@ from velap.runs import make_generator
 from velap.training.frozen import LatentData
 
 
+@pytest.fixture(autouse=True)
+def small_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks that learn little data in few updates."""
+    for name, value in {"GENERATIVE": (32, 32), "POLICY": (32, 32), "NOISE_DIM": 2}.items():
+        monkeypatch.setattr(f"velap.methods.iris.{name}", value)
+
+
 def walks(length: int = 12, copies: int = 60) -> LatentData:
     """Straight walks along a line: half of them to the right (action 0.5), half to the left (-0.5), z = (place, 0)."""
     place, action, last = [], [], []

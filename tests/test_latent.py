@@ -6,24 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from velap.config import Config, ModelConfig
+from tiny_training import SMALL as TINY
+from velap.config import Config
 from velap.errors import VelapError
-from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.checkpoint import load_checkpoint, save_checkpoint, shared_weights
+from velap.models.velap import LatentModel, Spaces
 
-SMALL = ModelConfig(
-    frame_stack=2,
-    latent_dim=5,
-    encoder_filters=(4, 4),
-    encoder_kernels=(4, 4),
-    encoder_strides=(2, 2),
-    encoder_dense=(8,),
-    dynamics_dense=(16, 16),
-    generative_dense=(16,),
-    noise_dim=2,
-    policy_dense=(16,),
-    critic_dense=(16, 16),
-    bank_size=10,
-)
+SMALL = dataclasses.replace(TINY, latent_dim=5)
 
 
 def make_model(**changes) -> LatentModel:
@@ -42,14 +31,14 @@ def make_model(**changes) -> LatentModel:
 
 @pytest.mark.parametrize("prefix", [(), (3,), (2, 3), (0, 2)])
 @pytest.mark.parametrize(
-    "changes", [{}, {"norm": "batch"}, {"norm": "none"}, {"critic_bounded": False, "dynamics_residual": False}]
+    "changes", [{}, {"norm": "batch"}, {"critic_bounded": False, "dynamics_residual": False}]
 )
 @pytest.mark.parametrize("hidden", [None, "float32"])
 def test_search_functions_equal_the_model(prefix, changes, hidden):
     model = make_model(**changes)
-    fns = model.search_fns(2.0, hidden)
+    fns = model.search_fns(hidden)
     z, goal = torch.randn(*prefix, 5), torch.randn(*prefix, 5)
-    action, noise = torch.rand(*prefix, 2) * 2 - 1, torch.randn(*prefix, 2)
+    action, noise = torch.rand(*prefix, 2) * 2 - 1, torch.randn(*prefix, 16)
     pairs = [
         (fns["propose"](z, noise), model.propose(z, noise)),
         (fns["act_global"](z), model.act_global(z)),
@@ -61,7 +50,7 @@ def test_search_functions_equal_the_model(prefix, changes, hidden):
     ]
     for got, expected in pairs:
         torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
-    assert fns["d_neigh"] == 1.0
+    assert fns["d_neigh"] == 1.5
     assert fns["step_distance"] == 0.5
 
 
@@ -115,20 +104,38 @@ def test_encode_takes_any_prefix_and_reads_every_frame_of_the_stack():
     assert (model.encode(changed) - latents).abs().max() > 1e-4
 
 
-def test_half_weights_halve_the_checkpoint_and_are_read_into_single_precision(tmp_path):
+def test_large_weights_are_stored_in_half_precision_and_read_into_single(tmp_path, monkeypatch):
     sizes, read = {}, {}
-    for half in (False, True):
-        model = make_model(half_weights=half, policy_dense=(128, 128))
+    for limit in (10_000_000, 100_000):
+        monkeypatch.setattr("velap.models.checkpoint.HALF_ABOVE", limit)
+        model = make_model()
         config = Config("SpiralMaze", "default", model=model.config)
         digest = save_checkpoint(tmp_path / "model.safetensors", model, config, {})
-        sizes[half] = (tmp_path / "model.safetensors").stat().st_size
-        read[half], again, _ = load_checkpoint(tmp_path / "model.safetensors")
+        sizes[limit] = (tmp_path / "model.safetensors").stat().st_size
+        read[limit], again, _ = load_checkpoint(tmp_path / "model.safetensors")
         assert again == config
         # what was rounded stays as it is
-        assert save_checkpoint(tmp_path / "again.safetensors", read[half], config, {}) == digest
-    assert sizes[True] < 0.6 * sizes[False]
-    for (name, exact), rounded in zip(read[False].state_dict().items(), read[True].state_dict().values(), strict=True):
+        assert save_checkpoint(tmp_path / "again.safetensors", read[limit], config, {}) == digest
+    single, half = read.values()
+    assert sizes[100_000] < 0.6 * sizes[10_000_000]
+    for (name, exact), rounded in zip(single.state_dict().items(), half.state_dict().values(), strict=True):
         assert rounded.dtype == exact.dtype
         rough = 1e-3 if exact.dtype == torch.float32 and exact.dim() > 1 else 0.0
         torch.testing.assert_close(rounded, exact, rtol=rough, atol=1e-3 * rough, msg=name)
-    assert not torch.equal(read[True].dynamics.state_dict()["0.weight"], read[False].dynamics.state_dict()["0.weight"])
+    assert not torch.equal(half.dynamics.state_dict()["0.weight"], single.dynamics.state_dict()["0.weight"])
+
+
+def test_heads_belong_to_the_weights_that_they_act_by(tmp_path):
+    """Local critics, bank and planner may change beside a head; encoder and π^g may not."""
+    hashes = {}
+    for name in ("same", "local", "bank", "encoder", "global"):
+        model, config = make_model(), Config("SpiralMaze", "default", model=SMALL)
+        parts = {"local": model.local_critics, "encoder": model.encoder, "global": model.global_policy}
+        if name in parts:
+            next(parts[name].parameters()).add_(1.0)
+        elif name == "bank":
+            model.bank_latents.add_(1.0)
+        save_checkpoint(tmp_path / name, model, config, {})
+        hashes[name] = shared_weights(load_checkpoint(tmp_path / name)[2])
+    assert hashes["same"] == hashes["local"] == hashes["bank"]
+    assert len({hashes["same"], hashes["encoder"], hashes["global"]}) == 3

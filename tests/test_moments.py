@@ -7,17 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from test_joint import SMALL, config, make_store, straight_and_resumed
-from velap.config import ModelConfig
+from tiny_training import SMALL, config, make, make_store, straight_and_resumed
 from velap.data.sampling import WindowSampler
-from velap.errors import ConfigError
-from velap.models.encoders.moments import KEPT_LIMIT, KEPT_SCALE, LIMIT, ColourMoments, MomentEncoder
-from velap.models.velap import LatentModel, Spaces, load_checkpoint
-from velap.training.latents import all_moments, encode_all, encode_rows
-from velap.training.loop import Trainer
-from velap.training.slow import LAG, MomentObjective, fit_palette, slow_features
+from velap.models.checkpoint import load_checkpoint
+from velap.models.encoders.moments import KEPT_LIMIT, KEPT_SCALE, LAG, LIMIT, ColourMoments, MomentEncoder, slow_features
+from velap.models.velap import LatentModel, Spaces
+from velap.training.encoding import encode_all, encode_rows
 
-SEEING = dataclasses.replace(SMALL, moment_colours=4)
+WHOLLY, SLOWLY = (dataclasses.replace(SMALL, encoder=name) for name in ("moments", "slow-moments"))
 GREY, RED, BLUE = (90, 90, 90), (200, 20, 20), (20, 20, 200)
 
 
@@ -104,90 +101,62 @@ def test_short_episodes_have_slow_features_too():
     assert all(part.isfinite().all() for part in slow_features(torch.randn(6, 4), last, 2))
 
 
-def make_seeing() -> tuple[LatentModel, WindowSampler]:
+@pytest.fixture
+def few_colours(monkeypatch):
+    """A small palette and few slow features."""
+    monkeypatch.setattr("velap.models.encoders.moments.COLOURS", 4)
+    monkeypatch.setattr("velap.models.encoders.moments.SLOW", 3)
+
+
+@pytest.mark.usefixtures("few_colours")
+@pytest.mark.parametrize("settings", [WHOLLY, SLOWLY])
+def test_latents_of_a_dataset_are_those_of_its_stacks(settings):
     torch.manual_seed(0)
-    model = LatentModel(SEEING, Spaces(16, 16, (-2.0,) * 3, (2.0,) * 3), 0.96).eval().requires_grad_(False)
+    model = LatentModel(settings, Spaces(16, 16, (-2.0,) * 3, (2.0,) * 3), 0.96).eval().requires_grad_(False)
     sampler = WindowSampler(make_store(), config().train, 2, torch.device("cpu"), np.zeros(0, np.int64))
-    assert isinstance(model.encoder, MomentEncoder)
-    fit_palette(model.encoder, sampler, 0)
-    return model, sampler
-
-
-def test_latents_of_a_dataset_are_those_of_its_stacks():
-    model, sampler = make_seeing()
+    features = model.encoder.fit(sampler.frames, sampler.last, 0)
+    assert features.shape == (len(sampler.frames), 24)
     rows = torch.arange(len(sampler.frames))
     together = encode_all(model, sampler)
-    assert together.std(0).amin() > 0
-    torch.testing.assert_close(together, encode_rows(model, sampler, rows, chunk=5))
+    assert torch.equal(together, encode_all(model, sampler, features)) and together.std(0).amin() > 0
+    torch.testing.assert_close(together, encode_rows(model, sampler, rows))
     torch.testing.assert_close(together[3:7].view(2, 2, -1), model.encode(sampler.stacks(rows[3:7]).unflatten(0, (2, 2))))
 
 
+@pytest.mark.usefixtures("few_colours")
 def test_the_encoder_learns_moments_and_slow_features(tmp_path: Path):
-    wide = dataclasses.replace(SEEING, latent_dim=16, encoder_dense=(32,))
-    run = Trainer(config(wide, encoder_steps=400, encoder_pairs=32), make_store(), tmp_path, 0, torch.device("cpu"))
-    losses = [run.update() for _ in range(400)]
-    assert isinstance(run.learner.pairs, MomentObjective)
+    run = make(tmp_path, config(dataclasses.replace(WHOLLY, latent_dim=16), encoder={"steps": 200, "pairs": 32}))
+    losses = [run.update() for _ in range(200)]
     for name in ("encoder/moments", "encoder/slow"):
         early, late = (np.mean([float(info[name]) for info in part]) for part in (losses[:5], losses[-5:]))
         assert late < 0.8 * early, name
 
 
+@pytest.mark.usefixtures("few_colours")
+@pytest.mark.parametrize("settings", [WHOLLY, SLOWLY])
 @pytest.mark.parametrize("stop", [1, 3, 5])
-def test_a_training_with_moments_resumes_to_the_same_bits_and_is_read_again(tmp_path: Path, stop: int):
-    settings = config(SEEING, encoder_steps=2, joint_steps=2, latent_steps=2)
-    _, second = straight_and_resumed(tmp_path, settings, stop)
+def test_a_training_with_moments_resumes_to_the_same_bits_and_is_read_again(tmp_path: Path, settings, stop: int):
+    asked = config(settings, encoder={"steps": 2}, joint={"steps": 2}, latent={"steps": 2})
+    _, second = straight_and_resumed(tmp_path, asked, stop)
     read, _, _ = load_checkpoint(second.finish("test").checkpoint)
     assert isinstance(read.encoder, MomentEncoder)
     assert torch.equal(read.encoder.moments.palette, second.model.encoder.moments.palette)
 
 
-SLOWLY = dataclasses.replace(SEEING, latent_dim=SEEING.latent_dim + 3, slow_features=3)
-WHOLLY = dataclasses.replace(SLOWLY, latent_dim=SLOWLY.latent_dim + 6 * SLOWLY.moment_colours, keep_moments=True)
-
-
-def test_slow_features_and_moments_stand_behind_what_is_learnt_and_stay_as_they_are(tmp_path: Path):
-    settings = config(WHOLLY, encoder_steps=3, joint_steps=2, latent_steps=1, heads_afresh=True)
-    run = Trainer(settings, make_store(), tmp_path, 0, torch.device("cpu"))
-    encoder, rows = run.model.encoder, torch.arange(len(run.sampler.frames))
+@pytest.mark.usefixtures("few_colours")
+@pytest.mark.parametrize("settings", [WHOLLY, SLOWLY])
+def test_what_is_kept_stands_behind_what_is_learnt_and_stays_as_it_is(tmp_path: Path, settings):
+    run = make(tmp_path, config(settings, encoder={"steps": 3}, joint={"steps": 2}, latent={"steps": 1}))
+    encoder, moments = run.model.encoder, run.run.features
     assert isinstance(encoder, MomentEncoder)
-    assert not encoder.slow_directions.any()  # they are found with the first update
-    run.update()
-    moments = all_moments(encoder, run.sampler)
     mean, directions = slow_features(moments, run.sampler.last, 3)
     slow = (KEPT_SCALE * (moments - mean) @ directions).clamp(-KEPT_LIMIT, KEPT_LIMIT)
-    expected = torch.cat([slow, KEPT_SCALE * moments], 1)
-    kept = expected.shape[1]
-    assert kept == 3 + 24
-    for _ in range(2):  # the joint phase and the heads from new weights change what is learnt alone
+    expected = KEPT_SCALE * moments if settings is WHOLLY else slow
+    for _ in range(2):  # the joint phase changes what is learnt alone
         latents = encode_all(run.model, run.sampler)
-        assert latents.shape == (len(rows), WHOLLY.latent_dim)
-        torch.testing.assert_close(latents[:, -kept:], expected, atol=1e-4, rtol=1e-4)
+        assert latents.shape == (len(moments), encoder.width(settings)) and encoder.learnt_width(settings) == 4
+        torch.testing.assert_close(latents[:, 4:], expected, atol=1e-4, rtol=1e-4)
         stacks = torch.stack([moments, moments], 1)
-        torch.testing.assert_close(encoder.from_moments(stacks)[:, :-kept], encoder.learnt(stacks))
+        torch.testing.assert_close(encoder.encode(stacks)[:, :4], encoder.learnt(stacks))
         while run.step < run.total:
             run.update()
-
-
-@pytest.mark.parametrize("stop", [1, 3])
-def test_a_training_with_slow_features_resumes_to_the_same_bits(tmp_path: Path, stop: int):
-    straight_and_resumed(tmp_path, config(SLOWLY, encoder_steps=2, joint_steps=1, latent_steps=2, heads_afresh=True), stop)
-
-
-@pytest.mark.parametrize("fields", [{"slow_features": 3}, {"moment_colours": 4, "slow_features": 32},
-                                    {"moment_colours": 1, "slow_features": 7}, {"keep_moments": True},
-                                    {"moment_colours": 4, "latent_dim": 24, "keep_moments": True},
-                                    {"moment_colours": 4, "latent_dim": 40, "slow_features": 16, "keep_moments": True}])
-def test_more_features_than_there_can_be_are_refused(fields):
-    with pytest.raises(ConfigError, match=r"slow_features|keep_moments|latent_dim"):
-        ModelConfig(**fields)
-
-
-def test_slow_features_ask_for_an_encoder_phase():
-    with pytest.raises(ConfigError, match="encoder_steps"):
-        config(SLOWLY)
-
-
-@pytest.mark.parametrize("colours", [-1, 257])
-def test_a_palette_without_sense_is_refused(colours: int):
-    with pytest.raises(ConfigError, match="moment_colours"):
-        ModelConfig(moment_colours=colours)

@@ -66,12 +66,14 @@ def actions_of(agent: VelapAgent, seeds: tuple[int, ...], batch: int) -> tuple[d
     {"residuals": 10},
     {"revisit_penalty": 0.3},
     {"success_rollout": 15, "goal_lookahead": 2},
-    {"success_exponent": 3.0, "shortcut_exponent": 4.0, "held_turn": 3},
+    {"success_exponent": 3.0, "shortcut_exponent": 4.0},
 ], ids=lambda controller: "-".join(controller) or "algorithm-2")
-def test_every_episode_takes_the_same_actions_in_any_batch(controller: dict[str, Any]) -> None:
-    in_turns = "held_turn" in controller
+def test_every_episode_takes_the_same_actions_in_any_batch(
+        controller: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("velap.methods.leaders.HELD_TURN", 3)
+    in_turns = "success_exponent" in controller
     config = override(toy_config(n_iter=40), controller={"n_replan": 5, **controller},
-                      model={"success_policy": True, "held_policy": in_turns})
+                      train={"clone": {"steps": 1}, "held": {"steps": int(in_turns)}})
 
     def agent() -> VelapAgent:
         model = UpwardsModel if in_turns else ToyModel

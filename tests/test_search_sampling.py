@@ -7,7 +7,7 @@ import torch
 from scipy.stats import chisquare
 
 from velap.config.planning import PlannerConfig
-from velap.search.sampling import draw_noise, node_distribution, sample_nodes
+from velap.search.sampling import TEMPERATURE_SPARSE, TEMPERATURE_VALUE, draw_noise, node_distribution, sample_nodes
 
 COUNTS = torch.tensor([[0, 1, 3, 2, 0]])
 VALUES = torch.tensor([[0.2, 0.1, 0.5, 0.45, -torch.inf]], dtype=torch.float64)
@@ -15,8 +15,8 @@ USED = torch.tensor([[True, True, True, True, False]])
 
 
 def by_hand(cfg: PlannerConfig) -> torch.Tensor:
-    sparse = torch.exp(-COUNTS[0, :4].double() / cfg.temperature_sparse)
-    value = torch.exp(VALUES[0, :4] / cfg.temperature_value)
+    sparse = torch.exp(-COUNTS[0, :4].double() / TEMPERATURE_SPARSE)
+    value = torch.exp(VALUES[0, :4] / TEMPERATURE_VALUE)
     rest = 1 - cfg.p_sparse - cfg.p_value
     return cfg.p_sparse * sparse / sparse.sum() + cfg.p_value * value / value.sum() + rest / 4
 
@@ -25,7 +25,7 @@ def by_hand(cfg: PlannerConfig) -> torch.Tensor:
     ("p_sparse", "p_value"), [(1.0, 0.0), (0.0, 1.0), (0.0, 0.0), (0.4, 0.4), (0.7, 0.3)],
 )
 def test_distribution_is_eq_6_and_7(p_sparse: float, p_value: float) -> None:
-    cfg = PlannerConfig(p_sparse=p_sparse, p_value=p_value, temperature_sparse=0.7, temperature_value=0.2)
+    cfg = PlannerConfig(p_sparse=p_sparse, p_value=p_value)
     found = node_distribution(COUNTS, VALUES, USED, cfg)
     torch.testing.assert_close(found[0, :4], by_hand(cfg), rtol=1e-6, atol=1e-7)
     assert found[0, 4].item() == 0

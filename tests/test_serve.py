@@ -31,25 +31,23 @@ from velap.config import Config, override
 from velap.data.frames import Reading
 from velap.errors import ConfigError, ObservationError
 from velap.evaluation.evaluate import Evaluation, load_player
-from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.checkpoint import load_checkpoint, save_checkpoint
+from velap.models.velap import LatentModel, Spaces
 from velap.serve.messages import pack, unpack
 from velap.serve.server import Server
 from velap.serve.session import PictureReader, Policy, Session, load_policy
 
 ROOT = Path(__file__).resolve().parents[1]
-SIDE, STACK = 16, 3
+SIDE, STACK = 64, 3
 LOW, HIGH = (-1.0, 0.0, 2.0), (1.0, 4.0, 2.5)
 
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights, three frames of 16 pixels a state, a plan every four steps, a memory of past commands."""
-    model = {"frame_stack": STACK, "latent_dim": 5, "encoder_filters": (4, 4), "encoder_kernels": (4, 4), "bank_size": 0,
-             "encoder_strides": (2, 2), "encoder_dense": (8,), "dynamics_dense": (16, 16), "generative_dense": (16,),
-             "noise_dim": 2, "policy_dense": (16,), "critic_dense": (16, 16), "command_memory": 0.5}
+    model = {"frame_stack": STACK, "latent_dim": 5, "bank_size": 0, "command_dims": 3}
     config = override(Config(task="toy", preset="default"), model=model, controller={"n_replan": 4},
-                      train={"precision": "float32"},
-                      planner={"n_iter": 12, "candidates": 4, "n_sim": 2, "discard_std": 10.0, "discard_low_exponent": 1e4,
+                      planner={"n_iter": 12, "candidates": 4, "n_sim": 2, "discard_low_exponent": 1e4,
                                "discard_high_exponent": 1e-6})
     torch.manual_seed(0)
     network = LatentModel(config.model, Spaces(SIDE, SIDE, LOW, HIGH), 0.96)
@@ -252,13 +250,13 @@ def test_grey_pictures_are_repeated() -> None:
 
 
 @pytest.mark.parametrize(("sent", "key", "text"), [
-    ({"image": picture(0) / 255}, None, r"'image' is float64\[16, 16, 3\]; expected uint8\[16, 16, 3\].*255 \* picture"),
+    ({"image": picture(0) / 255}, None, r"'image' is float64\[64, 64, 3\]; expected uint8\[64, 64, 3\].*255 \* picture"),
     ({"image": picture(0).astype(np.int32)}, None, "int32"),
     ({"image": picture(0)[:, :12]}, None, "square of another size"),
     ({"image": np.zeros((SIDE, SIDE, 4), np.uint8)}, None, "without alpha"),
     ({"image": np.zeros((SIDE, SIDE, 9), np.uint8)}, None, "stacks frames itself"),
     ({"image": picture(0)[None]}, "image", "one picture at a time"),
-    ({"image": picture(0)[None]}, None, r"0 pictures.*'image': uint8\[1, 16, 16, 3\]"),
+    ({"image": picture(0)[None]}, None, r"0 pictures.*'image': uint8\[1, 64, 64, 3\]"),
     ({"image": np.zeros((4, 4, 3), np.uint8)}, None, r"uint8\[4, 4, 3\]"),
     ({}, None, "no array"),
     ({"left": picture(0), "right": picture(1)}, None, r"2 pictures.*--image-key"),

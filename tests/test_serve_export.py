@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import torch
 
+import tiny_training  # noqa: F401 - registers the tiny encoder
 from velap import api, cli
 from velap.config import Config, override
 from velap.errors import ConfigError, VelapError
-from velap.models.velap import LatentModel, Spaces, load_checkpoint, save_checkpoint
+from velap.models.checkpoint import load_checkpoint, make_model, save_checkpoint
+from velap.models.velap import COMMAND_MEMORY, Spaces
 from velap.serve.export import export
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,13 +29,10 @@ LOW, HIGH = (-1.0, 0.0, 2.0), (1.0, 4.0, 2.5)
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights of every policy there is, three frames a state, a memory of past commands."""
-    model = {"frame_stack": STACK, "latent_dim": 5, "encoder_filters": (4, 4), "encoder_kernels": (4, 4), "bank_size": 8,
-             "encoder_strides": (2, 2), "encoder_dense": (8,), "dynamics_dense": (16, 16), "generative_dense": (16,),
-             "noise_dim": 2, "policy_dense": (16,), "critic_dense": (16, 16), "command_memory": 0.5, "success_policy": True,
-             "held_policy": True}
-    config = override(Config(task="toy", preset="default"), model=model)
+    model = {"encoder": "tiny", "frame_stack": STACK, "latent_dim": 5, "bank_size": 8, "command_dims": 3}
+    config = override(Config(task="toy", preset="default"), model=model, train={"clone": {"steps": 1}, "held": {"steps": 1}})
     torch.manual_seed(0)
-    network = LatentModel(config.model, Spaces(SIDE, SIDE, LOW, HIGH), 0.96, config.train.precision)
+    network = make_model(config, Spaces(SIDE, SIDE, LOW, HIGH))
     path = tmp_path_factory.mktemp("run") / "model.safetensors"
     save_checkpoint(path, network, config, {"seed": "3"})
     return path
@@ -68,7 +67,7 @@ def test_programs_are_the_model(checkpoint: Path, exported: Path) -> None:
 def test_the_description_says_what_a_robot_needs(checkpoint: Path, exported: Path) -> None:
     about = json.loads((exported / "export.json").read_text())
     assert (about["task"], about["frame_stack"], about["image_shape"]) == ("toy", STACK, [SIDE, SIDE, 3])
-    assert (about["action_low"], about["action_high"], about["command_memory"]) == (list(LOW), list(HIGH), 0.5)
+    assert (about["action_low"], about["action_high"], about["command_memory"]) == (list(LOW), list(HIGH), COMMAND_MEMORY)
     assert about["weights_sha256"] == load_checkpoint(checkpoint)[2]["weights_sha256"]
     assert all(program["max_difference"] <= 1e-4 for program in about["programs"].values())
     assert len(about["programs"]["act_local"]["inputs"]) == 2

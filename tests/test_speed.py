@@ -17,7 +17,7 @@ from rich.console import Console
 from studies.speed import benchmarks, command
 from studies.speed.benchmarks import Measurement, in_turns, peak_memory, synthetic_store
 from studies.speed.command import BENCHMARKS, Benchmark, run_benchmarks
-from velap.config import Config, override
+from velap.config import Config, EncoderPhase, JointPhase, override
 from velap.data.frames import content_hash
 from velap.data.loading import load_store
 from velap.data.writing import write_dataset
@@ -126,18 +126,17 @@ def test_the_minutes_of_a_training_are_updates_over_the_rate_of_their_phase(monk
         """An update of the encoder phase takes 0.1 s, one of the joint phase 0.4 s, the first of each a minute more."""
 
         device = CPU
-        config = override(make_config("FaucetClose"), train={"encoder_steps": 600, "joint_steps": 300, "latent_steps": 0,
-                                                             "clone_steps": 0})
-        step = 0
+        phases = (EncoderPhase(600), JointPhase(300))
 
         def __init__(self) -> None:
-            self.begun: set[bool] = set()
+            self.finished, self.done, self.begun = 0, 0, set[int]()
 
         def update(self) -> None:
-            joint = self.step >= 600
-            clock[0] += (0.4 if joint else 0.1) + 60 * (joint not in self.begun)
-            self.begun.add(joint)
-            self.step += 1
+            clock[0] += (0.1, 0.4)[self.finished] + 60 * (self.finished not in self.begun)
+            self.begun.add(self.finished)
+            self.done += 1
+            if self.done == self.phases[self.finished].steps:
+                self.finished, self.done = self.finished + 1, 0
 
     assert benchmarks.training_minutes(Run(), most=3.0) == pytest.approx((600 * 0.1 + 300 * 0.4) / 60)
 

@@ -37,7 +37,8 @@ from velap.config import override
 from velap.errors import ConfigError, RecordError, UnknownTaskError
 from velap.evaluation.records import Record, RecordFile, RunKey, read_records
 from velap.evaluation.summary import mcnemar, mean_and_spread
-from velap.models.velap import WEIGHTS_SHA256, LatentModel, Spaces, save_checkpoint
+from velap.models.checkpoint import WEIGHTS_SHA256, save_checkpoint
+from velap.models.velap import LatentModel, Spaces
 from velap.tasks import get_task, make_config
 
 ROOT = Path(__file__).resolve().parents[1]

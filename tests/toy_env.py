@@ -83,7 +83,7 @@ class ToyModel(nn.Module):
         self.held_policy = None
         self.encoded_batches: list[int] = []
 
-    action_dim, config = 2, ModelConfig(frame_stack=2)
+    action_dim, config, memory = 2, ModelConfig(frame_stack=2), 0.0
     spaces = Spaces(SIDE, SIDE, (-ACTION_SCALE,) * 2, (ACTION_SCALE,) * 2)
 
     def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
@@ -108,7 +108,7 @@ class ToyModel(nn.Module):
     def to_env(self, action: Tensor) -> np.ndarray:
         return (ACTION_SCALE * action).numpy().astype(np.float32)
 
-    def search_fns(self, neighbour_distance_factor: float = 3.0, hidden: str | None = None) -> dict[str, object]:
+    def search_fns(self, hidden: str | None = None) -> dict[str, object]:
         return self._fns._asdict()
 
 

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from velap.config import Config, override
+from velap.config.training import DYNAMICS_HORIZON
 from velap.errors import ConfigError
 from velap.storage import OWN_RECORDS, run_dir
 from velap.tasks import TASKS, get_task, make_config, task_of
@@ -26,10 +27,11 @@ if TYPE_CHECKING:
     from velap.data.success import Predicate
     from velap.evaluation.summary import Summary
     from velap.methods.base import Agent
+    from velap.training.loggers import Logger
     from velap.training.steps import Progress
 
 Changes = Mapping[str, Mapping[str, Any]]
-"""Config fields to replace: `{"train": {"joint_steps": 2000}}`."""
+"""Config fields to replace: `{"train": {"joint": {"steps": 2000}}}`."""
 
 
 def config_for(task: str, preset: str, changes: Changes | None) -> Config:
@@ -59,8 +61,9 @@ def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwr
 
 def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Path | None = None, *,
           method: str = "velap", image_key: str | None = None, device: str = "auto", resume: bool = False,
-          changes: Changes | None = None, base: Path | None = None, fit: Fit | None = None, image_size: int = 64,
+          changes: Changes | None = None, fit: Fit | None = None, image_size: int = 64,
           success: str | Predicate | None = None, mapped: bool | None = None, command: str = "velap.train",
+          loggers: Sequence[str | Logger] = ("jsonl", "tensorboard"),
           on_progress: Callable[[Progress], None] = lambda progress: None) -> Path:
     """Train on a task's dataset, or on any dataset of images and continuous actions; returns the joint checkpoint.
 
@@ -81,8 +84,8 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         device: `auto`, `cpu` or `cuda`.
         resume: go on with the joint run in `out`; a finished one is left as it is. Heads always go on.
         changes: config fields to replace; under `head` those of the method's learner.
-        base: a finished checkpoint of the same config, seed and data, of which only VELAP's own policies are learnt anew.
         command: kept in the checkpoint as its origin.
+        loggers: names (`jsonl`, `tensorboard`, `wandb`) or objects with `log` and `close`.
         on_progress: called after every logged step.
     """
     from velap.data.loading import load_store
@@ -98,23 +101,23 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
     learner = kind.learner_config(preset, of_head) if kind.learns or of_head else None
     config = config_for(task, preset, changes)
     dataset_id = TASKS[task_or_dataset].dataset_id if task_or_dataset in TASKS else task_or_dataset
-    store = load_store(dataset_id, image_key, config.train.dynamics_horizon, image_size, fit=fit, success=success,
-                       mapped=mapped)
+    store = load_store(dataset_id, image_key, DYNAMICS_HORIZON, image_size, fit=fit, success=success, mapped=mapped)
     directory = out or run_dir(task, preset, seed)
     checkpoint = directory / MODEL
     if not kind.whole_checkpoint and checkpoint.exists():
         _check_origin(checkpoint, task, preset, seed, changes)
     elif not (resume and _is_finished(checkpoint, config, seed, store.content_hash)):
-        run(config, store, directory, seed=seed, device=device, resume=resume, base=base, command=command,
+        run(config, store, directory, seed=seed, device=device, resume=resume, command=command, loggers=loggers,
             on_progress=on_progress)
     if learner is not None:
-        train_head(method, checkpoint, store, config=learner, device=device, command=command, on_progress=on_progress)
+        train_head(method, checkpoint, store, config=learner, device=device, command=command, loggers=loggers,
+                   on_progress=on_progress)
     return checkpoint
 
 
 def _check_origin(checkpoint: Path, task: str, preset: str, seed: int, changes: Changes) -> None:
     """Raises ConfigError unless a joint checkpoint comes from this task, preset and seed and has the fields of `changes`."""
-    from velap.models.velap import load_checkpoint
+    from velap.models.checkpoint import load_checkpoint
 
     _, config, metadata = load_checkpoint(checkpoint)
     found, asked = (config.task, config.preset, int(metadata["seed"])), (task, preset, seed)
@@ -129,7 +132,7 @@ def _check_origin(checkpoint: Path, task: str, preset: str, seed: int, changes: 
 
 def _is_finished(checkpoint: Path, config: Config, seed: int, dataset_hash: str) -> bool:
     """Whether the checkpoint is there and is what this run would give; a resume then leaves it, and its records, alone."""
-    from velap.models.velap import load_checkpoint
+    from velap.models.checkpoint import load_checkpoint
 
     if not checkpoint.exists():
         return False
@@ -148,7 +151,7 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
     """
     from velap.methods.base import get_method, make_agent
     from velap.methods.heads import head_path, load_head
-    from velap.models.velap import load_checkpoint
+    from velap.models.checkpoint import load_checkpoint
     from velap.training.loop import pick_device
 
     model, config, metadata = load_checkpoint(Path(checkpoint), pick_device(device))

@@ -1,13 +1,12 @@
-"""Losses, one function an equation, each `(loss, info)`.
+"""Losses, one function an equation, in the paper's order; each returns `(loss, info)`.
 
-Letters: T transitions, n ensemble members, k rollout steps, W rollouts, C candidates, D latent, A action dimension.
-`weight` [T] is 1 for real transitions and 0 for padding.
+Letters: T transitions, n ensemble members, k rollout steps, W rollouts, C candidates, D latent, A action dimension, m noise
+dimension, M frames. `weight` [T] is 1 for real transitions and 0 for padding.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +15,10 @@ from velap.config.training import CriticLoss
 from velap.models.horizon import Q_FLOOR
 
 Info = dict[str, Tensor]
+KL_WEIGHT = 0.01
+"""β of the action cVAE, Table 4."""
+TEMPERATURE = 1.0
+"""T of the similarity in Eq. 9, Table 7."""
 
 
 def weighted_mean(value: Tensor, weight: Tensor) -> Tensor:
@@ -24,27 +27,56 @@ def weighted_mean(value: Tensor, weight: Tensor) -> Tensor:
     return total / weight.sum().clamp(min=1)
 
 
+def model_loss(local: Tensor, task: Tensor, dynamics: Tensor, c0: float, c1: float) -> Tensor:
+    """L_model = 1/n_ens Σ_k L_Q^l_k + c0 · L_Q^g + c1 · L_h, Eq. 2; `local` is the mean over the members already."""
+    return c1 * dynamics + (local + c0 * task)
+
+
+def local_critic_loss(
+    q: Tensor, reward: Tensor, proceeds: Tensor, next_q: Tensor, weight: Tensor, *, discount: float, kind: CriticLoss = "mse"
+) -> tuple[Tensor, Info]:
+    """L_Q^l = E_D'[(Q_k^l(z_t, z_*, a_t) - (r_t + γ Q_min^{t+1,*}))²], Eq. 3, mean over members k.
+
+    q [n, T]; reward, proceeds, next_q [T] of the relabelled transitions; next_q is the targets' minimum [Q-value].
+    """
+    return critic_loss(q, td_target(reward, proceeds, next_q, discount), weight, kind=kind)
+
+
+def global_critic_loss(
+    q: Tensor, reward: Tensor, proceeds: Tensor, next_q: Tensor, weight: Tensor, *, discount: float,
+    kind: CriticLoss = "mse", floor: float = 0.0
+) -> tuple[Tensor, Info]:
+    """L_Q^g = E_D[(Q^g(z_t, a_t) - (r_t + γ Q^g(z_{t+1}, π^g(z_{t+1}))))²], Eq. 4, mean over members.
+
+    q [n, T]; reward, proceeds, next_q [T] of the task [Q-value]; `floor` is that of `cross_entropy_critic_loss`.
+    """
+    return critic_loss(q, td_target(reward, proceeds, next_q, discount), weight, kind=kind, floor=floor)
+
+
 def td_target(reward: Tensor, proceeds: Tensor, next_q: Tensor, discount: float) -> Tensor:
     """r + γ · proceeds · Q(s', π(s')), Eq. 3 and 4; no gradient. All [T]; `proceeds` is 0 at terminals."""
     return (reward + discount * proceeds * next_q).detach()
 
 
-def critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Info]:
-    """Squared TD error, Eq. 3 and 4, mean over members. q [n, T] or [T], target [T] [Q-value]."""
+def critic_loss(
+    q: Tensor, target: Tensor, weight: Tensor, *, kind: CriticLoss = "mse", floor: float = 0.0
+) -> tuple[Tensor, Info]:
+    """Squared TD error of Eq. 3 and 4, or the cross entropy of bounded critics (ours). q [n, T] or [T], target [T]."""
+    if kind == "cross_entropy":
+        return cross_entropy_critic_loss(q, target, weight, floor)
     loss = weighted_mean((q - target).square(), weight)
     return loss, {"loss": loss.detach(), "q": weighted_mean(q.detach(), weight)}
 
 
 def cross_entropy_critic_loss(q: Tensor, target: Tensor, weight: Tensor, floor: float = 0.0) -> tuple[Tensor, Info]:
-    """Cross entropy of bounded critics (ours): the same mean as the squared TD error's, but errors of small values count.
+    """Cross entropy of bounded critics, less the target's entropy (ours): errors of small values count too.
 
     q [n, T] or [T] and target [T], both in [0, 1] [Q-value]. The gradient of the squared error at the output before the
-    sigmoid is (q - target) · q · (1 - q), which vanishes far from the goal; here it is q - target. The loss is less the
-    target's entropy, so that it is 0 at best.
+    sigmoid is (q - target) · q · (1 - q), which vanishes far from the goal; here it is q - target.
 
-    The loss of a relative error grows with the target still: a step too many counts twenty times more near the goal than 75
-    steps from it. With a `floor` above 0 each transition counts by 1 / (target + floor), relative to their mean, and a step
-    is a step down to targets of about the floor.
+    The loss of a relative error still grows with the target: an error of one step counts twenty times more near the goal
+    than 75 steps from it. With a `floor` above 0 each transition counts by 1 / (target + floor), relative to their mean;
+    then steps count alike down to targets of about the floor.
     """
     target = target.expand_as(q)
     entropy = nn.functional.binary_cross_entropy(target, target, reduction="none")
@@ -56,9 +88,17 @@ def cross_entropy_critic_loss(q: Tensor, target: Tensor, weight: Tensor, floor: 
     return loss, {"loss": loss.detach(), "q": weighted_mean(q.detach(), weight)}
 
 
-def critic_error(kind: CriticLoss, floor: float = 0.0) -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Info]]:
-    """The loss of critics of that kind, a function of (q, target, weight); the floor is that of the cross entropy."""
-    return partial(cross_entropy_critic_loss, floor=floor) if kind == "cross_entropy" else critic_loss
+def policy_loss(
+    q: Tensor, action: Tensor, data_action: Tensor, imitation: float, weight: Tensor, *, relative: bool = False
+) -> tuple[Tensor, Info]:
+    """L_π = E[-Q] + c · E[(π - a_t)²], Eq. 5. q [T], actions [T, A] in [-1, 1]; the square is averaged over A, as TD3-BC
+    does.
+
+    With `relative` (ours) Q counts relative to its own size, so that steps count alike far from the goal and near it.
+    """
+    cloning = weighted_mean(cloning_error(action, data_action), weight)
+    loss = imitation * cloning - weighted_mean(q / q.detach().clamp(min=Q_FLOOR) if relative else q, weight)
+    return loss, {"loss": loss.detach(), "imitation": cloning.detach()}
 
 
 def cloning_error(action: Tensor, data_action: Tensor) -> Tensor:
@@ -66,28 +106,10 @@ def cloning_error(action: Tensor, data_action: Tensor) -> Tensor:
     return (action - data_action).square().mean(-1)
 
 
-def policy_loss(
-    q: Tensor, action: Tensor, data_action: Tensor, imitation: float, weight: Tensor, *, relative: bool = False
-) -> tuple[Tensor, Info]:
-    """-Q + c · (π - a)², Eq. 5. q [T], actions [T, A] in [-1, 1]; the square is averaged over A, as TD3-BC does.
-
-    With `relative` (ours) Q counts in its own size, so that steps count alike far from the goal and near it.
-    """
-    cloning = weighted_mean(cloning_error(action, data_action), weight)
-    loss = imitation * cloning - weighted_mean(q / q.detach().clamp(min=Q_FLOOR) if relative else q, weight)
-    return loss, {"loss": loss.detach(), "imitation": cloning.detach()}
-
-
-def latent_distances(a: Tensor, b: Tensor) -> Tensor:
-    """Euclidean distances `[*, W, D], [*, C, D] → [*, W, C]`, with a finite gradient at zero."""
-    squares = a.square().sum(-1, keepdim=True) + b.square().sum(-1).unsqueeze(-2) - 2 * a @ b.transpose(-1, -2)
-    return squares.clamp(min=1e-6).sqrt()
-
-
 def infonce_loss(
-    predicted: Tensor, positive: Tensor, candidates: Tensor, valid: Tensor, temperature: float
+    predicted: Tensor, positive: Tensor, candidates: Tensor, valid: Tensor, temperature: float = TEMPERATURE
 ) -> tuple[Tensor, Info]:
-    """Contrastive dynamics loss, Eq. 9: mean over the k steps of -log f(z̃, z⁺) / Σ_j f(z̃, z_j), f = exp(-‖·‖/T).
+    """L_h = -1/k Σ_k E_D[log f(z̃, z⁺) / Σ_j f(z̃, z_j)], f = exp(-‖·‖/T), Eq. 9.
 
     predicted [k, W, D]; positive int64 [k, W], the row of `candidates` [C, D] that is the true latent; valid bool [k, W].
     The sum runs over all candidates, the positive one included.
@@ -100,8 +122,14 @@ def infonce_loss(
     return loss, {"loss": loss.detach()}
 
 
+def latent_distances(a: Tensor, b: Tensor) -> Tensor:
+    """Euclidean distances `[*, W, D], [*, C, D] → [*, W, C]`, with a finite gradient at zero."""
+    squares = a.square().sum(-1, keepdim=True) + b.square().sum(-1).unsqueeze(-2) - 2 * a @ b.transpose(-1, -2)
+    return squares.clamp(min=1e-6).sqrt()
+
+
 def rollout_mse_loss(predicted: Tensor, actual: Tensor, valid: Tensor, scale: Tensor) -> tuple[Tensor, Info]:
-    """Mean-squared rollout error (App. E.3) over real steps, in units of `scale`² (mean square one-step change; [] or 1).
+    """Mean-squared rollout error over real steps, App. E.3, in units of `scale`² (mean square one-step change; [] or 1).
 
     predicted, actual [k, W, D]; valid bool [k, W]. No gradient flows into `actual`.
     """
@@ -114,7 +142,7 @@ def rollout_mse_loss(predicted: Tensor, actual: Tensor, valid: Tensor, scale: Te
 def action_model_loss(
     decoded: Tensor, action: Tensor, mean: Tensor, log_variance: Tensor, kl_weight: float, weight: Tensor
 ) -> tuple[Tensor, Info]:
-    """β-VAE of Table 4: ‖a - â‖² + β · KL(q(noise | z, a) ‖ N(0, 1)). decoded, action [T, A]; mean, log_variance [T, m]."""
+    """‖a - â‖² + β · KL(q(noise | z, a) ‖ N(0, 1)), β-VAE of Table 4. decoded, action [T, A]; mean, log_variance [T, m]."""
     reconstruction = weighted_mean((decoded - action).square().sum(-1), weight)
     divergence = weighted_mean(0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1), weight)
     loss = reconstruction + kl_weight * divergence

@@ -9,7 +9,6 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -98,26 +97,3 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             f"{path} is damaged: its content does not match the SHA-256 it carries. Restore it from a copy, or train again."
         )
     return tensors, metadata
-
-
-class MetricsLog:
-    """`metrics.jsonl` of a run, one line a logged step; a resume drops what came after its checkpoint."""
-
-    def __init__(self, path: Path, resumed_step: int | None) -> None:
-        self.path = Path(path)
-        kept: list[str] = []
-        if resumed_step is not None and self.path.exists():
-            kept = [line for line in self.path.read_text().splitlines() if _step_of(line) <= resumed_step]
-        write_atomic(self.path, "".join(f"{line}\n" for line in kept).encode())
-
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Adds one row; it must hold `step`."""
-        with storage_errors(self.path), open(self.path, "a") as file:
-            file.write(json.dumps(row) + "\n")
-
-
-def _step_of(line: str) -> float:
-    try:
-        return float(json.loads(line)["step"])
-    except (ValueError, KeyError, TypeError):
-        return float("inf")

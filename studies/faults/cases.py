@@ -218,9 +218,9 @@ CASES: tuple[Case, ...] = (
     Case("unknown preset", ("train", "SpiralMaze", "--preset", "best"), "best"),
     Case("unknown option", ("train", "SpiralMaze", "--sede", "1"), "--sede"),
     Case("unknown command", ("fly",), "fly"),
-    Case("unknown config field", (*TRAIN, "--set", "train.nothing=3"), "no field ['nothing']"),
-    Case("config field out of range", (*TRAIN, "--set", "train.window=0"), "expected at least 1"),
-    Case("config field of another type", (*TRAIN, "--set", "train.window=x"), "expected int"),
+    Case("unknown config field", (*TRAIN, "--set", "train.nothing=3"), "no field 'nothing'"),
+    Case("config field out of range", (*TRAIN, "--set", "train.joint.window=0"), "expected 1 or more"),
+    Case("config field of another type", (*TRAIN, "--set", "train.joint.window=x"), "expected int"),
     Case("unknown environment", ("evaluate", "x", "--method", "random", "--env", "NoSuch-v0"), "Gymnasium cannot make"),
 )
 

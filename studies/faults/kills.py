@@ -27,9 +27,8 @@ from velap.errors import VelapError
 from velap.tasks import TASKS
 
 TASK = "SpiralMaze"
-SMALL = {
-    "train": {"joint_steps": 12, "latent_steps": 12, "batch_windows": 4, "log_every": 2,
-              "diagnose_every": 6, "checkpoint_every": 2, "holdout_episodes": 2},
+SMALL: dict[str, dict[str, Any]] = {
+    "train": {"joint": {"steps": 12, "windows": 4}, "latent": {"steps": 12}, "log_every": 2, "checkpoint_every": 2},
     "planner": {"n_iter": 10, "candidates": 5}, "model": {"bank_size": 32},
 }
 """Config fields of the shrunk task. ours: a run of seconds that checkpoints every other step, in both phases."""
@@ -44,7 +43,7 @@ def shrink() -> None:
     """Replace SpiralMaze in this process by a version with little data and little training."""
     task = TASKS[TASK]
     recipe = dataclasses.replace(task.recipe, trajectories=TRAJECTORIES)
-    TASKS[TASK] = dataclasses.replace(task, recipe=recipe, overrides={}, default_overrides=SMALL)
+    TASKS[TASK] = dataclasses.replace(task, recipe=recipe, overrides=SMALL)
 
 
 def shrunk_main(main: Callable[[], int]) -> int:

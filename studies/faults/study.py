@@ -176,7 +176,7 @@ def report(command: str, reports: Sequence[KillReport], results: Sequence[CaseRe
     kills = "\n".join(f"| `{entry.command}` | {entry.kills} | {_verdict(entry.problems)} |" for entry in reports)
     faults = "\n".join(f"| {entry.fault} | `{entry.command}` | {_cell(entry.message)} | {entry.code} | "
                        f"{_verdict(entry.problems)} |" for entry in results)
-    train = ", ".join(f"{name} {SMALL['train'][name]}" for name in ("joint_steps", "latent_steps", "checkpoint_every"))
+    train = ", ".join(f"{name} {value}" for name, value in SMALL["train"].items())
     return f"""# Faults
 
 Written by `{command} --write docs/faults.md`; run it again after a change. All runs are commands in processes of their

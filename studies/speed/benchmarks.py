@@ -24,21 +24,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from velap.config import ModelConfig, override
+from velap.cli.memory import keep_freed_memory
+from velap.config import JointPhase, ModelConfig, override
 from velap.config.planning import PlannerConfig
 from velap.data.frames import FrameStore
 from velap.data.loading import load_store
 from velap.data.writing import write_dataset
 from velap.errors import CheckpointError, VelapError
 from velap.methods.mppi import MPPIConfig, shoot
-from velap.models.velap import LatentModel, Spaces, load_checkpoint
+from velap.models.checkpoint import load_checkpoint
+from velap.models.velap import LatentModel, Spaces
 from velap.report.demo import released_checkpoint
 from velap.runs import make_generator
 from velap.search.est import plan
 from velap.search.types import SearchFns
 from velap.tasks import get_task, make_config
 from velap.threads import usable_cores
-from velap.training.loop import Trainer, keep_freed_memory, train
+from velap.training.joint import JointLearner
+from velap.training.loop import Trainer, train
 
 TASK = "SpiralMaze"
 DATASET = "bench/synthetic-v0"
@@ -115,9 +118,9 @@ def train_minutes(device: torch.device) -> Measurement:
     for graphs in sides:
         with TemporaryDirectory() as folder:
             trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
-            trainer.learner.graphs = graphs
+            trainer.run.graphs = graphs
             minutes.append(training_minutes(trainer))
-    updates = ", ".join(f"{steps} {name}" for name, steps in settings.train.phases if steps)
+    updates = ", ".join(f"{phase.updates} {phase.label}" for phase in settings.train.phases)
     name = "without CUDA graphs" if len(sides) > 1 else "none"
     return Measurement(minutes[0], "min", f"{name}; updates: {updates}", minutes[1] if len(sides) > 1 else None)
 
@@ -125,20 +128,18 @@ def train_minutes(device: torch.device) -> Measurement:
 def training_minutes(trainer: Trainer, warm: int = 16, count: int = 200, most: float = 6.0) -> float:
     """Minutes of all updates of a run, by each phase's rate: that of `count` updates after `warm` ones, or of as many as
     `most` [s] are enough for."""
-    minutes, begins = 0.0, 0
-    for _, steps in trainer.config.train.phases:
-        if steps == 0:
-            continue
-        trainer.step = begins
-        for _ in range(min(warm, steps)):
+    minutes = 0.0
+    for phase in trainer.phases:
+        warmed = min(warm, phase.updates - 1)
+        for _ in range(warmed):
             trainer.update()
         began, done = _now(trainer.device), 0
-        while done < count and (done == 0 or time.perf_counter() - began < most):
-            trainer.step = begins + min(warm, steps - 1)
+        while done < min(count, phase.updates - warmed - 1) and (done == 0 or time.perf_counter() - began < most):
             trainer.update()
             done += 1
-        minutes += steps * (_now(trainer.device) - began) / done / 60
-        begins += steps
+        minutes += phase.updates * (_now(trainer.device) - began) / done / 60
+        trainer.done = phase.updates - 1  # the last one, after which the next phase begins
+        trainer.update()
     return minutes
 
 
@@ -155,10 +156,11 @@ def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
     with TemporaryDirectory() as folder:
         settings = override(make_config(TASK), model={"frame_stack": frame_stack})
         trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
-        config, encoder = trainer.config.train, trainer.model.encoder
-        batch = trainer.sampler.sample(config.batch_windows, config.window, config.whole_windows, trainer.generator)
+        phase, encoder = trainer.phases[0], trainer.model.encoder
+        assert isinstance(phase, JointPhase), f"{TASK} begins with its joint phase"
+        batch = trainer.sampler.sample(JointLearner(phase, trainer.run).draw, trainer.run.generator, phase.rewarded_share)
         stacks = trainer.sampler.stacks(batch.rows)
-        updates = 4 * config.policy_every
+        updates = 4 * trainer.config.train.policy_every
 
         def update() -> None:
             for _ in range(updates):
@@ -173,7 +175,7 @@ def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
         trained, encoded = in_turns([update, encode], 12, device)
     frames = updates * len(stacks)
     return Measurement(frames / trained, "frames/s", f"encoder alone, forward and backward, batch of {len(stacks)} frames, "
-                       f"stacks of {frame_stack}, {config.precision}", frames / encoded)
+                       f"stacks of {frame_stack}, bfloat16", frames / encoded)
 
 
 def _planning_model(device: torch.device) -> tuple[LatentModel, PlannerConfig, str]:
@@ -190,7 +192,7 @@ def _planning_model(device: torch.device) -> tuple[LatentModel, PlannerConfig, s
     latents = _roots(model, 256)
     actions = torch.rand(256, 2, generator=make_generator(1)).to(device) * 2 - 1
     model.step_distance.copy_((model.step(latents, actions) - latents).norm(dim=-1).quantile(0.95))
-    changes = {"discard_low_exponent": 1e4, "discard_std": 2.0, "discard_high_exponent": 1e-6}
+    changes = {"discard_low_exponent": 1e4, "discard_high_exponent": 1e-6}
     return model, override(make_config(TASK, "paper"), planner=changes).planner, "random weights, full trees"
 
 
@@ -208,7 +210,7 @@ def _plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int = P
     """Latency per environment of a VELAP plan for `batch` environments at once against MPPI with the same model."""
     model, planner, kind = _planning_model(device)
     planner = replace(planner, n_sim=n_sim)
-    fns = SearchFns(**model.search_fns(planner.neighbour_distance_factor))
+    fns = SearchFns(**model.search_fns())
     shots, together, seeds = MPPIConfig(), min(batch, MPPI_BATCH), count()
     roots, plans = _roots(model, batch), PLANS_A_TURN if batch == 1 else 1
 
@@ -380,7 +382,7 @@ def write_synthetic() -> None:
 
 def print_peak(run_dir: str, device: str) -> None:
     """Body of the process that `train_rss` measures: trains and prints its peak and the dataset's size [bytes]."""
-    short = {"joint_steps": 30, "latent_steps": 30, "checkpoint_every": 20, "diagnose_every": 20, "log_every": 10}
+    short = {"joint": {"steps": 30}, "latent": {"steps": 30}, "checkpoint_every": 20, "log_every": 10}
     store = load_store(DATASET)
     train(override(make_config(TASK), train=short), store, Path(run_dir), device=device)
     print(peak_memory(), store.nbytes)

@@ -20,7 +20,7 @@ from velap.errors import ConfigError, RecordError, UnknownTaskError
 from velap.evaluation.records import Record, read_records, record_path
 from velap.methods.base import get_method
 from velap.methods.heads import head_path
-from velap.models.velap import WEIGHTS_SHA256, shared_weights
+from velap.models.checkpoint import WEIGHTS_SHA256, shared_weights
 from velap.registry import METHODS
 from velap.runs import write_atomic
 from velap.storage import run_dir
@@ -165,21 +165,25 @@ def record_problem(cell: Cell, records: Sequence[Record]) -> str:
         "env_kwargs": {}, "image_key": None, "max_steps": task.max_steps, "config_hash": config_hash}
     if joint is not None:
         expected["checkpoint"] = joint[WEIGHTS_SHA256] if method.whole_checkpoint else shared_weights(joint)
+    same = {"config_hash": expected_hash(cell, legacy=True)}
     for name, value in expected.items():
-        others = sorted({str(getattr(record, name))[:12] for record in records if getattr(record, name) != value})
+        found = {str(getattr(record, name)): getattr(record, name) for record in records}
+        others = sorted(text[:12] for text, got in found.items() if got != value and got != same.get(name, value))
         if others:
             return f"its `{name}` is {', '.join(others)}, that of today {str(value)[:12]}"
     return ""
 
 
-def expected_hash(cell: Cell) -> str | None:
-    """The `config_hash` that an evaluation of the cell writes today; None where its head is not known."""
-    config = make_config(cell.task, cell.preset)
+def expected_hash(cell: Cell, legacy: bool = False) -> str | None:
+    """The `config_hash` that an evaluation of the cell writes today, or that velap 0.1 wrote (`legacy`); None where its head
+    is not known."""
+    config, method = make_config(cell.task, cell.preset), get_method(cell.method)
+    hash_of = method.legacy_hash if legacy else method.config_hash
     if cell.head is None:
-        return get_method(cell.method).config_hash(config)
+        return hash_of(config)
     metadata = file_metadata(cell.head)
     weights = metadata[WEIGHTS_SHA256] if metadata is not None else training_notes().get(cell.names[1], {}).get("identity")
-    return None if weights is None else get_method(cell.method).config_hash(config, _Head(head_settings(cell), weights))
+    return None if weights is None else hash_of(config, _Head(head_settings(cell), weights))
 
 
 @dataclass

@@ -17,7 +17,7 @@ from studies.table1.paper import TABLE_1
 from velap.evaluation.records import select
 from velap.evaluation.summary import Episodes, mcnemar, mean_and_spread, summarise
 from velap.methods.base import get_method
-from velap.models.velap import WEIGHTS_SHA256, shared_weights
+from velap.models.checkpoint import WEIGHTS_SHA256, shared_weights
 from velap.tasks import PRESETS
 
 MISSING = "–"

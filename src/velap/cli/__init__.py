@@ -14,6 +14,7 @@ from typing import Any
 import tyro
 
 from velap._version import __version__
+from velap.cli.config import config
 from velap.cli.evaluate import demo, diagnose, evaluate
 from velap.cli.info import info
 from velap.cli.options import ERR, OUT, Settings, note, say
@@ -26,7 +27,7 @@ __all__ = ["COMMANDS", "OUT", "Settings", "main"]
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": demo, "collect": collect, "train": train, "evaluate": evaluate, "run": run, "table": table, "bench": bench,
-    "diagnose": diagnose, "study": study, "figure": figure, "info": info, "serve": serve, "export": export,
+    "diagnose": diagnose, "study": study, "figure": figure, "config": config, "info": info, "serve": serve, "export": export,
 }
 GREEDY = ("--set", "--only", "--env-kwargs")
 """Options that take several values of the form NAME=VALUE."""

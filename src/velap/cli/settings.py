@@ -1,4 +1,4 @@
-"""`--set PART.FIELD=VALUE` of the command line."""
+"""`--set PART.FIELD=VALUE` of the command line; `velap config` lists all fields."""
 
 from __future__ import annotations
 
@@ -7,31 +7,46 @@ from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-from velap.config import Config
+from velap.config.fields import hints, typed
+from velap.config.serialise import PARTS
 from velap.errors import ConfigError
-
-PARTS = ("model", "train", "planner", "controller")
 
 
 def parse_settings(settings: Sequence[Sequence[str]], further: Mapping[str, object] | None = None,
                    ) -> dict[str, dict[str, Any]]:
-    """`[["planner.n_iter=500"]]` -> `{"planner": {"n_iter": 500}}`; raises ConfigError on any other form.
+    """`[["planner.n_iter=500", "train.joint.steps=9"]]` -> `{"planner": {"n_iter": 500}, "train": {"joint": {"steps": 9}}}`.
 
-    `further` parts beside those of the config, such as a method's own settings, with their defaults.
+    Raises ConfigError on any other form. `further` parts beside those of the config, such as a method's own settings, with
+    their defaults; the fields of the config are checked by what takes the changes, which knows its phases.
     """
-    parts = {**{part: getattr(Config(task="", preset=""), part) for part in PARTS}, **(further or {})}
+    parts = [*PARTS, *(further or {})]
     changes: dict[str, dict[str, Any]] = {}
     for setting in chain.from_iterable(settings):
         name, equals, text = setting.partition("=")
-        part, dot, field = name.partition(".")
-        if not (equals and dot and part in parts):
-            raise ConfigError(f"--set got {setting!r}; expected PART.FIELD=VALUE; parts are {', '.join(parts)}.")
-        try:
-            value = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
-            value = text
-        changes.setdefault(part, {})[field] = _as_type_of_default(parts[part], part, field, value)
+        part, *path = name.split(".")
+        if not (equals and part in parts and all(path) and 1 <= len(path) <= 1 + (part == "train")):
+            raise ConfigError(f"--set got {setting!r}; expected PART.FIELD=VALUE or train.PHASE.FIELD=VALUE; parts are "
+                              f"{', '.join(parts)}. `velap config` lists all fields.")
+        value, defaults = _value(text), (further or {}).get(part)
+        known = hints(type(defaults)) if defaults is not None else {}
+        if path[0] in known:
+            value = typed(value, known[path[0]], f"{part}.{path[0]}")
+        place = changes.setdefault(part, {})
+        for step in path[:-1]:
+            place = place.setdefault(step, {})
+        place[path[-1]] = value
     return changes
+
+
+def _value(text: str) -> Any:
+    """A number, a truth value, null or any other Python literal; text that is none of them."""
+    words = {"null": None, "none": None, "true": True, "false": False}
+    if text.lower() in words:
+        return words[text.lower()]
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text
 
 
 def parse_pairs(pairs: Sequence[str]) -> dict[str, Any]:
@@ -41,18 +56,5 @@ def parse_pairs(pairs: Sequence[str]) -> dict[str, Any]:
         name, equals, text = pair.partition("=")
         if not (equals and name.isidentifier()):
             raise ConfigError(f"--env-kwargs got {pair!r}; expected NAME=VALUE, such as obs_type=pixels.")
-        try:
-            parsed[name] = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
-            parsed[name] = text
+        parsed[name] = _value(text)
     return parsed
-
-
-def _as_type_of_default(defaults: object, part: str, field: str, value: Any) -> Any:
-    """`value` in the type of the field's default; unknown fields pass, what takes the changes names them."""
-    default = getattr(defaults, field, None)
-    if isinstance(default, float) and isinstance(value, int):
-        return float(value)
-    if default is not None and type(value) is not type(default):
-        raise ConfigError(f"--set got {value!r} for {part}.{field}; expected {type(default).__name__}, such as {default!r}.")
-    return value

@@ -39,7 +39,7 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
 
 def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: str | None = None,
           preset: Preset = "default", seed: int = 0, out: Path | None = None, device: Device = "auto", resume: bool = False,
-          settings: Settings = (), method: Method = "velap", base: Path | None = None, success: str | None = None,
+          settings: Settings = (), method: Method = "velap", success: str | None = None,
           fit: Literal["crop", "pad", "squash"] | None = None, image_size: int = 64, mapped: bool = False) -> None:
     """Train on a task's dataset or on any dataset of images and continuous actions.
 
@@ -58,8 +58,6 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
         fit: How images that are not square become square.
         image_size: Side that images are resized to [px].
         mapped: Map the frames from a file beside the dataset instead of reading them into memory.
-        base: Finished checkpoint of the same task, preset, seed and data: only the policies that VELAP alone acts by are
-            learnt anew.
     """
     if (task is None) == (dataset is None):
         raise ConfigError(f"got the task {task!r} and the dataset {dataset!r}; expected one of them: `velap train TASK` or "
@@ -69,21 +67,23 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
 
         get_task(task)
     train_with_progress(str(task or dataset), preset=preset, seed=seed, out=out, image_key=image_key, device=device,
-                        resume=resume, settings=settings, method=method, base=base,
+                        resume=resume, settings=settings, method=method,
                         reading={"success": success, "fit": fit, "image_size": image_size, "mapped": mapped or None})
 
 
 def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None, device: str, resume: bool,
                         settings: Sequence[Sequence[str]], image_key: str | None = None, method: str = "velap",
-                        base: Path | None = None, reading: Mapping[str, Any] | None = None) -> Path:
+                        reading: Mapping[str, Any] | None = None) -> Path:
     """Train and show how far it is; returns the joint checkpoint."""
     from velap import api
+    from velap.cli.memory import keep_freed_memory
     from velap.evaluation.console import TrainingBar
     from velap.methods.base import get_method
     from velap.methods.heads import head_path
     from velap.methods.learning import read_result
     from velap.training.loop import MODEL
 
+    keep_freed_memory()
     kind = get_method(method)
     changes = parse_settings(settings, {"head": kind.learner_config(preset)} if kind.learns else {})
     directory = out or api.run_dir(api.task_of(source), preset, seed)
@@ -91,7 +91,7 @@ def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None
         note(f"no joint checkpoint in {directory}; it is trained first")
     with TrainingBar(OUT) as view:
         checkpoint = api.train(source, preset, seed, out, method=method, image_key=image_key, device=device, resume=resume,
-                               changes=changes, base=base, command=command(), on_progress=view, **(reading or {}))
+                               changes=changes, command=command(), on_progress=view, **(reading or {}))
     say(f"checkpoint {checkpoint}")
     if kind.learns:
         result = read_result(head_path(checkpoint, method))
@@ -114,6 +114,7 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
     """
     from velap.api import config_for
     from velap.cli.evaluate import evaluate_with_progress
+    from velap.config import legacy_hash
     from velap.data import minari_io
     from velap.evaluation.evaluate import Evaluation
     from velap.evaluation.records import check_config, record_path
@@ -122,7 +123,7 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
     dataset_id = get_task(task).dataset_id
     if not fresh:
         config = config_for(task, preset, parse_settings(settings))
-        check_config(record_path(records, task, "velap", preset, seed), config.hash())
+        check_config(record_path(records, task, "velap", preset, seed), config.hash(), legacy_hash(config))
     if not minari_io.exists(dataset_id):
         collect(task, workers=workers)
     checkpoint = train_with_progress(task, preset=preset, seed=seed, out=out, device=device, resume=True, settings=settings)

@@ -1,4 +1,4 @@
-"""A leaky mean of the past actions, which stands behind the output of φ where a config has `command_memory` (ours).
+"""A leaky mean of the past actions, which stands behind the output of φ where a config has `command_dims` (ours).
 
 What follows its commands slowly has a speed, and a lag behind them, that a stack of frames shows to a pixel a step at best.
 The actions are known, so the mean of them is exact. F frames of a dataset, A action dimension; `*` is any batch prefix.

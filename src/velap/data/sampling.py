@@ -6,6 +6,7 @@ store.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,33 +16,65 @@ from torch import Tensor
 from velap.config.training import TrainConfig
 from velap.data.commands import past_commands
 from velap.data.frames import FrameStore, stack_indices
-from velap.data.relabelling import Relabelled, relabel
+from velap.data.relabelling import Later, goal_positions, later_in_window
 from velap.errors import DatasetError
 
 
+@dataclass(frozen=True)
+class WholeWindows:
+    """Windows anywhere in the episodes; values and dynamics learn from all over them, so that each frame is used often."""
+
+    windows: int
+    """B."""
+    length: int
+    """L [steps]."""
+    transitions: int = 0
+    """T that the values learn from, without repetition; 0 takes all."""
+    rollouts: int = 0
+    """W starts that the dynamics are unrolled from, without repetition; 0 takes all."""
+    horizon: int = 1
+    """Steps that the dynamics are unrolled: starts lie at least so far from the end of their window [steps]."""
+
+
+@dataclass(frozen=True)
+class FirstTransitions:
+    """Windows that begin at a drawn transition, the only one that values and dynamics learn from; later goals are frames of
+    their own."""
+
+    windows: int
+    """B."""
+    length: int
+    """L [steps]."""
+
+
 class Batch(NamedTuple):
-    """One sample. The first B·(L+1) of `rows` are the windows; positions index `rows`, so each frame is encoded once."""
+    """One sample. The first B·(L+1) of `rows` are the windows. What ends in `_at` is a position in `rows`, and so in the
+    latents of their frames: each frame is encoded once."""
 
     rows: Tensor
-    """int64 [M], frame rows to encode."""
+    """int64 [M], rows of the store whose frames are to be encoded."""
     valid: Tensor
     """bool [B, L], the transition lies inside its episode."""
     actions: Tensor
     """float32 [B, L, A] in [-1, 1]."""
-    unrolled: Tensor
-    """int64 [W], position of the latents that the dynamics are unrolled from."""
-    start: Tensor
-    """int64 [T], position of z_t."""
+    unroll_at: Tensor
+    """int64 [W], latents that the dynamics are unrolled from."""
+    now_at: Tensor
+    """int64 [T], z_t; z_{t+1} is the next one."""
+    goal_at: Tensor
+    """int64 [T], z_* of the local learners."""
     action: Tensor
     """float32 [T, A], a_t."""
     reward: Tensor
     """float32 [T], r_t of the task."""
     proceeds: Tensor
-    """float32 [T], 0 where the task ended at t+1, else 1; z_{t+1} is at `start + 1`."""
+    """float32 [T], 0 where the task ended at t+1, else 1."""
+    goal_reward: Tensor
+    """float32 [T], 1 where the next state is the goal."""
+    goal_proceeds: Tensor
+    """float32 [T], 0 where the goal is reached or the task ended at t+1, else 1."""
     weight: Tensor
     """float32 [T], 1 where the transition lies inside its episode."""
-    goals: Relabelled
-    """Goals of the local learners."""
 
 
 class WindowSampler:
@@ -74,52 +107,59 @@ class WindowSampler:
             raise DatasetError("the dataset has no transition to train on; expected episodes of at least one step.")
 
     def sample(
-        self, windows: int, length: int, whole: bool, generator: torch.Generator, *, rewarded_share: float | None = None
+        self, draw: WholeWindows | FirstTransitions, generator: torch.Generator, rewarded_share: float
     ) -> Batch:
-        """B `windows` of L `length` steps; with `whole` the values learn from transitions and the dynamics from starts all
-        over them (as many as the config says), else from each window's first. `rewarded_share` replaces the config's."""
-        share = self.config.rewarded_share if rewarded_share is None else rewarded_share
-        _, last, at = self._draw_windows(windows, length, whole, share, generator)
-        window_rows = torch.minimum(at[:, None] + torch.arange(length + 1, device=self.device), last[:, None])
-        valid = at[:, None] + torch.arange(length, device=self.device) < last[:, None]
+        """What `draw` says; `rewarded_share` of the windows hold a rewarded transition, beyond chance."""
+        windows, length = draw.windows, draw.length
+        last, first_row = self._draw_windows(draw, rewarded_share, generator)
+        window_rows = torch.minimum(first_row[:, None] + torch.arange(length + 1, device=self.device), last[:, None])
+        valid = first_row[:, None] + torch.arange(length, device=self.device) < last[:, None]
         positions = torch.arange(windows * (length + 1), device=self.device).view(windows, length + 1)
-        if whole:
-            ahead_of_end = length - self.config.dynamics_horizon + 1
-            start = self._draw(positions[:, :length], self.config.value_transitions, generator)
-            unrolled = self._draw(positions[:, :ahead_of_end], self.config.dynamics_rollouts, generator)
-        else:
-            start = unrolled = positions[:, 0]
-        inside = valid[start // (length + 1), start % (length + 1)]
         rows = window_rows.reshape(-1)
-        chosen = rows[start]
-        extra = None
-        if not whole:
-            span = (last - chosen - 1).clamp(min=0)
-            ahead = 2 + (torch.rand(windows, generator=generator, device=self.device) * span).long()
-            extra = torch.minimum(chosen + ahead, last)
-            rows = torch.cat([rows, extra])
-        goals = relabel(rows, start, inside, valid, self.config, generator)
-        ended = self.terminated[chosen]
-        proceeds = (~ended).float()
+        if isinstance(draw, WholeWindows):
+            now_at = self._choose(positions[:, :length], draw.transitions, generator)
+            unroll_at = self._choose(positions[:, : length - draw.horizon + 1], draw.rollouts, generator)
+            later = later_in_window(now_at, valid, generator)
+        else:
+            now_at = unroll_at = positions[:, 0]
+            rows, later = self._with_later_frames(rows, now_at, last, generator)
+        inside = valid[now_at // (length + 1), now_at % (length + 1)]
+        goal_at = goal_positions(now_at, inside, valid, later, self.config, generator)
+        reached = rows[goal_at] == rows[now_at + 1]
+        chosen = rows[now_at]
+        proceeds = (~self.terminated[chosen]).float()
         return Batch(
             rows=rows,
             valid=valid,
             actions=self.actions[window_rows[:, :-1]],
-            unrolled=unrolled,
-            start=start,
+            unroll_at=unroll_at,
+            now_at=now_at,
+            goal_at=goal_at,
             action=self.actions[chosen],
             reward=self.rewards[chosen],
             proceeds=proceeds,
+            goal_reward=reached.float(),
+            goal_proceeds=(~reached).float() * proceeds,
             weight=inside.float(),
-            goals=goals._replace(proceeds=goals.proceeds * proceeds),
         )
+
+    def _with_later_frames(
+        self, rows: Tensor, now_at: Tensor, last: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Later]:
+        """Rows [M + B]: one more frame for each window, two steps or more after its first where the episode goes on."""
+        first = rows[now_at]
+        span = (last - first - 1).clamp(min=0)
+        ahead = 2 + (torch.rand(len(now_at), generator=generator, device=self.device) * span).long()
+        frames = torch.minimum(first + ahead, last)
+        appended = len(rows) + torch.arange(len(now_at), device=self.device)
+        return torch.cat([rows, frames]), Later(appended, frames > rows[now_at + 1])
 
     def successes(self, reach: int = 0) -> Tensor:
         """Rows int64 [*] of the training transitions of successful episodes, with a `reach` above 0 of those at most so many
         steps before a reward; raises DatasetError where there are none."""
         if len(self.rewarded) == 0:
             raise DatasetError("the dataset has no successful episode to clone; expected at least one with a reward of 1. "
-                               "Collect or label some successes, or set `clone_steps` to 0.")
+                               "Collect or label some successes, or leave the clone phase out (train.clone.steps=0).")
         rows = self.transitions[torch.isin(self.first[self.transitions], self.first[self.rewarded])]
         if reach == 0:
             return rows
@@ -127,7 +167,7 @@ class WindowSampler:
         ahead = self.rewarded[following] - rows
         return rows[(ahead >= 0) & (ahead <= reach) & (self.first[self.rewarded[following]] == self.first[rows])]
 
-    def _draw(self, positions: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    def _choose(self, positions: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """`count` of the positions without repetition, or all of them where they are no more or `count` is 0."""
         everything = positions.reshape(-1)
         if not 0 < count < len(everything):
@@ -150,9 +190,10 @@ class WindowSampler:
         return self._commands[memory][rows]
 
     def _draw_windows(
-        self, windows: int, length: int, whole: bool, rewarded_share: float, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """First row and last row of each window's episode, and the window's first row, each int64 [B]."""
+        self, what: WholeWindows | FirstTransitions, rewarded_share: float, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Last row of each window's episode, and the window's first row, each int64 [B]."""
+        windows, length = what.windows, what.length
 
         def draw(pool: Tensor, n: int) -> Tensor:
             return pool[torch.randint(len(pool), (n,), generator=generator, device=self.device)]
@@ -163,11 +204,11 @@ class WindowSampler:
         if rewarded_share > 0 and len(self.rewarded):
             rare = torch.rand(windows, generator=generator, device=self.device) < rewarded_share
             anchor = torch.where(rare, draw(self.rewarded, windows), anchor)
-        first, last = self.first[anchor], self.last[anchor]
-        if not whole:
-            return first, last, anchor
+        last = self.last[anchor]
+        if isinstance(what, FirstTransitions):
+            return last, anchor
         back = torch.randint(length, (windows,), generator=generator, device=self.device)
-        return first, last, torch.maximum(torch.minimum(anchor - back, last - length), first)
+        return last, torch.maximum(torch.minimum(anchor - back, last - length), self.first[anchor])
 
     def _gather(self, anchor: Tensor, generator: torch.Generator) -> Tensor:
         """Anchors int64 [B] of which each group's first stays and the others move to episodes near its own."""

@@ -146,9 +146,11 @@ def _parse(path: Path, payload: bytes) -> tuple[list[Record], int]:
 class RecordFile:
     """The record file of one run, open for appending and locked against a second writer."""
 
-    def __init__(self, path: Path, key: RunKey, fresh: bool = False) -> None:
+    def __init__(self, path: Path, key: RunKey, fresh: bool = False, legacy_hash: str | None = None) -> None:
+        """`legacy_hash` is what velap 0.1 called the key's `config_hash`: records of both belong together."""
         self.path = path
         self.key = key
+        self._hashes = {key.config_hash, legacy_hash}
         with storage_errors(self.path), ExitStack() as opened:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             try:
@@ -168,7 +170,8 @@ class RecordFile:
         records, sound = _parse(self.path, self._stream.read())
         self._stream.truncate(sound)
         for record in records:
-            differing = [name for name in IDENTITY if getattr(record, name) != getattr(self.key, name)]
+            differing = [name for name in IDENTITY if getattr(record, name) != getattr(self.key, name)
+                         and not (name == "config_hash" and record.config_hash in self._hashes)]
             if differing:
                 name = differing[0]
                 raise RecordError(
@@ -215,10 +218,13 @@ def _free_name(path: Path) -> Path:
     return path.with_name(f"{path.name}.old-{number}")
 
 
-def check_config(path: Path, config_hash: str) -> None:
-    """Raises RecordError where a file already holds records of another config: better before a training than after it."""
+def check_config(path: Path, config_hash: str, legacy_hash: str | None = None) -> None:
+    """Raises RecordError where a file already holds records of another config: better before a training than after it.
+
+    `legacy_hash` is what velap 0.1 called the same config.
+    """
     found = {record.config_hash for record in read_records(path)} if path.exists() else {config_hash}
-    if found - {config_hash}:
+    if found - {config_hash, legacy_hash}:
         raise RecordError(f"{path} holds records of another config ({', '.join(sorted(found))}, now {config_hash}). Give "
                           "--fresh to move that file aside, or other --records.")
 

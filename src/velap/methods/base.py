@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from velap.config.migrate_v1 import legacy_json, legacy_shared_json
 from velap.errors import ConfigError, UnknownTaskError
 from velap.registry import METHODS
 
@@ -137,9 +138,18 @@ class Method(ABC):
 
     def config_hash(self, config: Config, head: Learnt | None = None, settings: Any = None) -> str:
         """The `config_hash` of its records, of everything that decides how it acts. `settings` None takes the preset's."""
+        return self._hash_of(config.hash() if self.whole_checkpoint else config.shared_json(), config, head, settings)
+
+    def legacy_hash(self, config: Config, head: Learnt | None = None, settings: Any = None) -> str | None:
+        """The `config_hash` of its records by velap 0.1; None for a config that velap 0.1 could not have."""
+        text = legacy_json(config) if self.whole_checkpoint else legacy_shared_json(config)
+        return None if text is None else self._hash_of(text, config, head, settings)
+
+    def _hash_of(self, text: str, config: Config, head: Learnt | None, settings: Any) -> str:
+        """Hash of the config's part in `text`, and of settings and head."""
         settings = settings or self.settings_of(config.preset)
         parts: dict[str, Any] = {"method": self.name, "settings": asdict(settings) if settings is not None else {},
-                                 "config": config.to_json() if self.whole_checkpoint else config.shared_json()}
+                                 "config": text}
         if self.learns:
             if head is None:
                 raise ConfigError(f"the method {self.name!r} acts by a head and got none; train it with `velap train TASK "

@@ -18,8 +18,9 @@ from velap._version import __version__
 from velap.config import Config, ModelConfig
 from velap.errors import CheckpointError
 from velap.methods.base import get_method, learning_methods
-from velap.models.networks import Policy
-from velap.models.velap import WEIGHTS_SHA256, restore, shared_weights
+from velap.models.checkpoint import WEIGHTS_SHA256, restore, shared_weights
+from velap.models.encoders.base import latent_width
+from velap.models.networks import POLICY, Policy
 from velap.registry import METHODS
 from velap.runs import content_sha256, load_tensors, save_tensors
 
@@ -47,7 +48,7 @@ class PolicyHead(Head):
 
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__(config, action_dim)
-        self.policy = Policy(config.width(action_dim), config.policy_dense, action_dim, config.norm)
+        self.policy = Policy(latent_width(config, action_dim), POLICY, action_dim, config.norm)
 
     def act(self, latent: Tensor) -> Tensor:
         """π: `[*, D] → [*, A]` in [-1, 1]."""

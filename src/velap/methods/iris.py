@@ -25,8 +25,9 @@ from velap.losses import Info, action_model_loss, cloning_error, reparameterise
 from velap.methods.base import Agent, Method, Parts
 from velap.methods.heads import Head
 from velap.methods.planning import PlanningAgent
-from velap.models.action_model import ConditionalVAE
-from velap.models.networks import Policy
+from velap.models.action_model import GENERATIVE, NOISE_DIM, ConditionalVAE
+from velap.models.encoders.base import latent_width
+from velap.models.networks import POLICY, Policy
 from velap.registry import register_method
 from velap.search.sampling import normal
 from velap.training.frozen import FrozenLearner, LatentData, LearnerConfig
@@ -88,9 +89,9 @@ class SubgoalHead(Head):
 
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__(config, action_dim)
-        latent, norm = config.width(action_dim), config.norm
-        self.manager = ConditionalVAE(latent, latent, config.noise_dim, config.generative_dense, norm, bounded=False)
-        self.worker = Policy(2 * latent, config.policy_dense, action_dim, norm)
+        latent, norm = latent_width(config, action_dim), config.norm
+        self.manager = ConditionalVAE(latent, latent, NOISE_DIM, GENERATIVE, norm, bounded=False)
+        self.worker = Policy(2 * latent, POLICY, action_dim, norm)
         self.register_buffer("steps_ahead", torch.tensor(0))
         self.register_buffer("change_scale", torch.ones(()))
         self.steps_ahead: Tensor

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from velap.config import Config
+from velap.config.planning import HELD_TURN
 from velap.errors import ConfigError
 from velap.models.arrivals import GAINS, arrivals
 from velap.models.horizon import q_from_steps
@@ -67,7 +68,7 @@ def leaders_of(config: Config, fns: SearchFns) -> list[Leader]:
 
 def global_policy_of(config: Config, model: LatentModel, fns: SearchFns) -> GlobalPolicy:
     """π^g, or the policy that the config puts in its place."""
-    policy: GlobalPolicy = Held(model, config.controller.held_turn) if model.held_policy is not None else Plain(model)
+    policy: GlobalPolicy = Held(model, HELD_TURN) if model.held_policy is not None else Plain(model)
     return Strongest(policy, fns, config.controller.goal_lookahead) if config.controller.goal_lookahead > 0 else policy
 
 

@@ -8,24 +8,25 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from velap.data.frames import FrameStore
 from velap.errors import CheckpointError, DatasetError, TrainingError, UnknownTaskError
 from velap.methods.base import get_method
 from velap.methods.heads import Head, head_path, make_head, save_head
-from velap.models.velap import load_checkpoint, shared_weights
-from velap.runs import MetricsLog, load_tensors, make_generator
+from velap.models.checkpoint import load_checkpoint, shared_weights
+from velap.runs import load_tensors, make_generator
 from velap.threads import one_thread
 from velap.training.frozen import FrozenLearner, LearnerConfig, latent_data
+from velap.training.loggers import DEFAULT, Logger, make_loggers
 from velap.training.loop import pick_device
-from velap.training.state import load_state, save_state
+from velap.training.state import SavedState, save_state
 from velap.training.steps import Cadence, Progress, interrupt_flag, run_steps
 
 CADENCE = Cadence(log=100, diagnose=1_000, checkpoint=5_000)
@@ -72,11 +73,6 @@ class HeadRun:
         """Beside the head."""
         return self.path.with_suffix(".state.safetensors")
 
-    @property
-    def events_dir(self) -> Path:
-        """A run of its own in the joint run's TensorBoard folder."""
-        return self.path.parent / "tensorboard" / self.path.stem
-
     def update(self) -> dict[str, Tensor]:
         """One update of the learner."""
         info = self.learner.update()
@@ -90,7 +86,11 @@ class HeadRun:
     def save(self) -> None:
         """Everything a resume needs."""
         progress = {"step": str(self.step), "seconds": repr(self.seconds)}
-        save_state(self.state_path, self.learner, self.identity | progress)
+        learner = self.learner
+        save_state(self.state_path, self._modules(), learner.optimizers, learner.generator, self.identity | progress)
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"head": self.learner.model, **self.learner.companions}
 
     def resume(self) -> int | None:
         """Go on from the state that an interrupted run left; None where there is none, or one of another run (a note says
@@ -98,11 +98,16 @@ class HeadRun:
         if not self.state_path.exists():
             return None
         try:
-            metadata = load_state(self.state_path, self.learner, self.identity)
+            state = SavedState(self.state_path)
+            state.require(self.identity)
         except CheckpointError as error:
             warnings.warn(f"the head is learnt from the start: {error}", UserWarning, stacklevel=3)
             return None
-        self.step, self.seconds = int(metadata["step"]), float(metadata["seconds"])
+        state.modules(self._modules())
+        state.optimizers(self.learner.optimizers)
+        state.generator(self.learner.generator)
+        self.step, self.seconds = int(state.metadata["step"]), float(state.metadata["seconds"])
+        self.learner.updates = self.step
         return self.step
 
 
@@ -115,7 +120,8 @@ def check_trainable(method: str) -> None:
 
 def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path | None = None, *, seed: int | None = None,
                device: str = "auto", steps: int | None = None, config: LearnerConfig | None = None,
-               command: str = "velap.train", on_progress: Callable[[Progress], None] = lambda progress: None) -> HeadResult:
+               command: str = "velap.train", loggers: Sequence[str | Logger] = DEFAULT,
+               on_progress: Callable[[Progress], None] = lambda progress: None) -> HeadResult:
     """Learn the head of a method on the latents of a joint checkpoint; a finished one is left as it is.
 
     Ctrl-C saves the state and raises KeyboardInterrupt; the same call goes on from there, to the same bits on a CPU.
@@ -130,6 +136,7 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
         steps: updates in place of the preset's.
         config: the learner's config in place of the preset's.
         command: kept in the head as its origin.
+        loggers: as in `velap.training.loop.train`.
         on_progress: called after every logged step.
     """
     kind = get_method(method)
@@ -157,7 +164,7 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
     data = latent_data(model, joint, metadata, store, checkpoint.parent)
     learner = kind.learner(head, data, config, make_generator(seed, stream=3, device=place))
     run = HeadRun(learner, path, identity)
-    _run(run, on_progress)
+    _run(run, loggers, on_progress)
     return _finish(run, head, metadata, {"command": command, "dataset_id": store.dataset_id})
 
 
@@ -186,11 +193,11 @@ def _finished(path: Path, identity: dict[str, str]) -> HeadResult | None:
     return _result(path, metadata)
 
 
-def _run(run: HeadRun, on_progress: Callable[[Progress], None]) -> None:
-    """From the start or the saved state to the end; raises KeyboardInterrupt after Ctrl-C, the state being saved."""
-    log = MetricsLog(run.path.with_suffix(".metrics.jsonl"), run.resume())
+def _run(run: HeadRun, loggers: Sequence[str | Logger], on_progress: Callable[[Progress], None]) -> None:
+    """From the start or the saved state to the end; raises KeyboardInterrupt once an interrupted state is saved."""
+    made = make_loggers(loggers, run.path.parent, run.path.stem, run.resume())
     with interrupt_flag() as interrupted, one_thread(run.learner.data.latents.device, small=True):
-        run_steps(run, log, on_progress, interrupted)
+        run_steps(run, made, on_progress, interrupted)
     if run.step < run.total:
         run.save()
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Frames to latents, with what an agent remembers of its own actions (`command_memory`, ours).
+"""Frames to latents, with what an agent remembers of its own actions (`command_dims`, ours).
 
 B environments, N stacked frames, A action dimension, D latent.
 """
@@ -67,7 +67,7 @@ class StateEncoder:
 
     def __init__(self, model: LatentModel) -> None:
         self._model = model
-        self._memory = model.config.command_memory
+        self._memory = model.memory
         self._device = next(model.parameters()).device
         self._commands = torch.empty(0, model.action_dim, device=self._device)
 

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from velap.config.migrate_v1 import legacy_hash
 from velap.methods.base import Agent, Learnt, Method, Parts, masked_seeds
 from velap.methods.corrections import corrections_of
 from velap.methods.leaders import global_policy_of, leaders_of
@@ -54,7 +55,7 @@ class VelapAgent:
         self.planned_rows: NDArray[np.int64] = np.empty(0, np.int64)
         """Rows that planned in the last `act`."""
         self._model, self._states = model, StateEncoder(model)
-        self._fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
+        self._fns = SearchFns(**model.search_fns())
         self._search, self._planner, self._n_replan = planner, config.planner, config.controller.n_replan
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._update_waypoint = waypoint_rules(config.controller, self._fns.discount)
@@ -216,3 +217,7 @@ class Velap(Method):
         """The config's own hash; with another planner, of that as well."""
         own = settings in (None, self.settings)
         return config.hash() if own else super().config_hash(config, head, settings)
+
+    def legacy_hash(self, config: Config, head: Learnt | None = None, settings: Any = None) -> str | None:
+        """The hash that velap 0.1 gave the config."""
+        return legacy_hash(config)

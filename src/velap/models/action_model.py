@@ -11,6 +11,11 @@ from torch import Tensor, nn
 from velap.config import Norm
 from velap.models.networks import MLP
 
+GENERATIVE = (128, 128, 128)
+"""Hidden layers of both halves of the action cVAE, Table 4."""
+NOISE_DIM = 16
+"""m, latent dimension of the action cVAE, Table 4."""
+
 
 class ConditionalVAE(nn.Module):
     """β-VAE over targets given a condition: `[*, condition], [*, target]`; the action model g of Eq. 1 uses it."""

@@ -1,4 +1,4 @@
-"""Networks of App. B.1 (Tables 2, 3, 5, 6). `*` is any batch prefix, D the latent and A the action dimension, n the
+"""Networks of App. B.1 (Tables 3, 5, 6). `*` is any batch prefix, D the latent and A the action dimension, n the
 members."""
 
 from __future__ import annotations
@@ -10,15 +10,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from velap.config import ModelConfig, Norm
-from velap.config.training import Precision
+from velap.config import Norm
 
+DYNAMICS = (128, 128, 128, 128)
+"""Hidden layers of h, Table 3."""
+POLICY = (128, 128, 128)
+"""Hidden layers of a policy, Table 5."""
+CRITIC = (128, 128, 128)
+"""Hidden layers of a critic, Table 6."""
 LEAK = 0.01
 """Negative slope of the activations (PyTorch's default; the tables say LeakyReLU only)."""
 
 
-def _norm_layer(norm: Norm, width: int) -> list[nn.Module]:
-    return {"batch": [nn.BatchNorm1d(width)], "layer": [nn.LayerNorm(width)], "none": []}[norm]  # type: ignore[return-value]
+def _norm_layer(norm: Norm, width: int) -> nn.Module:
+    return nn.BatchNorm1d(width) if norm == "batch" else nn.LayerNorm(width)
 
 
 class MLP(nn.Sequential):
@@ -27,7 +32,7 @@ class MLP(nn.Sequential):
     def __init__(self, inputs: int, hidden: Sequence[int], outputs: int, norm: Norm) -> None:
         layers: list[nn.Module] = []
         for width in hidden:
-            layers += [nn.Linear(inputs, width), *_norm_layer(norm, width), nn.LeakyReLU(LEAK, inplace=True)]
+            layers += [nn.Linear(inputs, width), _norm_layer(norm, width), nn.LeakyReLU(LEAK, inplace=True)]
             inputs = width
         super().__init__(*layers, nn.Linear(inputs, outputs))
         self._flat = norm == "batch"
@@ -60,7 +65,7 @@ class EnsembleMLP(nn.Module):
             if norm == "layer":
                 self.scales.append(nn.Parameter(torch.ones(n, 1, width)))
                 self.shifts.append(nn.Parameter(torch.zeros(n, 1, width)))
-            elif norm == "batch":
+            else:
                 self.norms.append(nn.BatchNorm1d(n * width))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -80,43 +85,8 @@ class EnsembleMLP(nn.Module):
     def _normalise(self, i: int, h: Tensor) -> Tensor:
         if self.norm == "layer":
             return torch.addcmul(self.shifts[i], F.layer_norm(h, h.shape[-1:]), self.scales[i])
-        if self.norm == "batch":
-            n, m, width = h.shape
-            return self.norms[i](h.permute(1, 0, 2).reshape(m, n * width)).reshape(m, n, width).permute(1, 0, 2)
-        return h
-
-
-class Encoder(nn.Module):
-    """φ, Table 2: convolutions and dense layers; uint8 `[*, N, H, W, 3] → [*, D]`.
-
-    Layer normalisation acts on the dense layers only: over convolution maps it costs as much as the convolutions (ours).
-    """
-
-    def __init__(self, config: ModelConfig, size: tuple[int, int], precision: Precision) -> None:
-        super().__init__()
-        channels = 3 * config.frame_stack
-        height, width = size
-        layers: list[nn.Module] = []
-        for filters, kernel, stride in zip(
-            config.encoder_filters, config.encoder_kernels, config.encoder_strides, strict=True
-        ):
-            layers.append(nn.Conv2d(channels, filters, kernel, stride))
-            if config.norm == "batch":
-                layers.append(nn.BatchNorm2d(filters))
-            layers.append(nn.LeakyReLU(LEAK, inplace=True))
-            height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
-            channels = filters
-        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.dense = MLP(channels * height * width, config.encoder_dense, config.latent_dim, config.norm)
-        self.dtype = getattr(torch, precision)
-
-    def forward(self, frames: Tensor) -> Tensor:
-        prefix, (n, h, w, c) = frames.shape[:-4], frames.shape[-4:]
-        x = frames.reshape(-1, n, h, w, c).permute(0, 2, 3, 1, 4).reshape(-1, h, w, n * c)
-        x = x.to(self.dtype).mul_(2 / 255).sub_(1).permute(0, 3, 1, 2)
-        with torch.autocast(frames.device.type, dtype=self.dtype, enabled=self.dtype != torch.float32):
-            x = self.convolutions(x).flatten(1)
-        return self.dense(x.float()).reshape(*prefix, -1)
+        n, m, width = h.shape
+        return self.norms[i](h.permute(1, 0, 2).reshape(m, n * width)).reshape(m, n, width).permute(1, 0, 2)
 
 
 class Policy(MLP):

@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from velap._version import __version__
-from velap.config import Config, ModelConfig
-from velap.config.training import Precision
-from velap.errors import CheckpointError, VelapError
-from velap.models.action_model import ConditionalVAE
-from velap.models.encoders.moments import MomentEncoder
+from velap.config import ModelConfig
+from velap.config.planning import NEIGHBOUR_DISTANCE, Precision
+from velap.errors import VelapError
+from velap.models.action_model import GENERATIVE, NOISE_DIM, ConditionalVAE
+from velap.models.encoders.base import encoder_class, latent_width
 from velap.models.inference import joined, nearest_row
-from velap.models.networks import MLP, Encoder, EnsembleMLP, Policy
+from velap.models.networks import CRITIC, DYNAMICS, MLP, POLICY, EnsembleMLP, Policy
 from velap.native.folded import dense_layers, fold
 from velap.native.kernels import native_rollout
-from velap.runs import content_sha256, load_tensors, save_tensors
 
 UNREWARDED = -4.0
 """Initial logit of bounded critics: sparse returns start near 0; from a half they would take thousands of updates to
 decay."""
 
+N_ENS = 3
+"""Members of the local ensemble, Table 7."""
+COMMAND_MEMORY = 0.7
+"""Share that the leaky mean of past commands keeps at a step. ours."""
 COMMAND_SCALE = 2.0
 """What the mean of past commands in a latent is multiplied by [latent distance]. ours."""
 
@@ -44,30 +43,30 @@ class Spaces:
 
 
 class LatentModel(nn.Module):
-    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1, and a policy cloned from successes and a held one where the config has them.
+    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1; on demand a policy cloned from successes and one of held actions (ours).
 
     Actions are in [-1, 1] inside; `to_env` and `to_unit` convert.
     """
 
-    def __init__(self, config: ModelConfig, spaces: Spaces, discount: float, precision: Precision = "float32") -> None:
+    def __init__(self, config: ModelConfig, spaces: Spaces, discount: float, *, clones: bool = False,
+                 holds: bool = False) -> None:
         super().__init__()
-        self.config, self.spaces, self.discount, self.precision = config, spaces, discount, precision
+        self.config, self.spaces, self.discount = config, spaces, discount
         action, norm = len(spaces.action_low), config.norm
-        latent = config.width(action)
-        size = (spaces.height, spaces.width)
-        self.encoder = MomentEncoder(config, size) if config.moment_colours > 0 else Encoder(config, size, precision)
-        self.dynamics = MLP(latent + action, config.dynamics_dense, latent, norm)
-        self.action_model = ConditionalVAE(latent, action, config.noise_dim, config.generative_dense, norm, bounded=True)
-        self.local_policy = Policy(2 * latent, config.policy_dense, action, norm)
-        self.global_policy = Policy(latent, config.policy_dense, action, norm)
-        self.local_critics = EnsembleMLP(config.n_ens, 2 * latent + action, config.critic_dense, norm)
-        self.global_critic = EnsembleMLP(config.n_global, latent + action, config.critic_dense, norm)
-        self.success_policy = Policy(latent, config.policy_dense, action, norm) if config.success_policy else None
-        self.held_policy = Policy(latent, config.policy_dense, action, norm) if config.held_policy else None
+        latent = latent_width(config, action)
+        self.encoder = encoder_class(config)(config, (spaces.height, spaces.width))
+        self.dynamics = MLP(latent + action, DYNAMICS, latent, norm)
+        self.action_model = ConditionalVAE(latent, action, NOISE_DIM, GENERATIVE, norm, bounded=True)
+        self.local_policy = Policy(2 * latent, POLICY, action, norm)
+        self.global_policy = Policy(latent, POLICY, action, norm)
+        self.local_critics = EnsembleMLP(N_ENS, 2 * latent + action, CRITIC, norm)
+        self.global_critic = EnsembleMLP(config.n_global, latent + action, CRITIC, norm)
+        self.success_policy = Policy(latent, POLICY, action, norm) if clones else None
+        self.held_policy = Policy(latent, POLICY, action, norm) if holds else None
         if config.critic_bounded:
             for critic in (self.local_critics, self.global_critic):
                 nn.init.constant_(critic.biases[-1], UNREWARDED)
-        if config.command_memory > 0:
+        if config.command_dims > 0:
             self.register_buffer("command_weight", torch.tensor(COMMAND_SCALE))
         self.register_buffer("action_low", torch.tensor(spaces.action_low))
         self.register_buffer("action_high", torch.tensor(spaces.action_high))
@@ -76,15 +75,16 @@ class LatentModel(nn.Module):
         self.register_buffer("bank_latents", torch.zeros(config.bank_size, latent, dtype=torch.float16))
         self.register_buffer("bank_rows", torch.full((config.bank_size,), -1, dtype=torch.int32))
         self.command_weight: Tensor
-        """float32 [], what the commands are multiplied by: `COMMAND_SCALE`, or 0 while a training is to do without them."""
+        """float32 [], `COMMAND_SCALE`."""
         self.action_low: Tensor
         self.action_high: Tensor
         self.step_distance: Tensor
+        """float32 [], upper 5-percentile of one-step distances in the data [latent distance]."""
         self.bank_latents: Tensor
         self.bank_rows: Tensor
 
     def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
-        """φ, and behind it the commands where the config has a memory of them: uint8 `[*, N, H, W, 3] → [*, D]`.
+        """φ, and behind it the remembered commands (`command_dims`): uint8 `[*, N, H, W, 3] → [*, D]`.
 
         commands `[*, A]`: leaky mean of the past actions in [-1, 1], `velap.data.commands`; None stands for zeros, as at the
         start of an episode.
@@ -93,12 +93,11 @@ class LatentModel(nn.Module):
 
     def with_commands(self, seen: Tensor, commands: Tensor | None = None) -> Tensor:
         """Output of φ `[*, d_Z]` and commands `[*, A]` → latents `[*, D]`."""
-        if self.config.command_memory == 0:
+        if self.config.command_dims == 0:
             return seen
         if commands is None:
             commands = seen.new_zeros(*seen.shape[:-1], self.action_dim)
-        remembered = self.config.command_dims or self.action_dim
-        return torch.cat([seen, self.command_weight * commands[..., :remembered]], -1)
+        return torch.cat([seen, self.command_weight * commands[..., : self.config.command_dims]], -1)
 
     def step(self, latent: Tensor, action: Tensor) -> Tensor:
         """h: `[*, D], [*, A] → [*, D]`."""
@@ -153,10 +152,11 @@ class LatentModel(nn.Module):
 
     @torch.no_grad()
     def start_heads_afresh(self, seed: int) -> None:
-        """New weights for everything but φ, commands included from here on; weights stay in their memory."""
+        """New weights for everything but φ; the parameters stay in their memory."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            new = LatentModel(self.config, self.spaces, self.discount, self.precision)
+            new = LatentModel(self.config, self.spaces, self.discount, clones=self.success_policy is not None,
+                              holds=self.held_policy is not None)
         new.encoder.load_state_dict(self.encoder.state_dict())
         self.load_state_dict(new.state_dict())
 
@@ -164,6 +164,16 @@ class LatentModel(nn.Module):
     def action_dim(self) -> int:
         """A."""
         return len(self.spaces.action_low)
+
+    @property
+    def seen_dim(self) -> int:
+        """Dimensions of the latent that φ gives; commands stand behind them."""
+        return self.encoder.width(self.config)
+
+    @property
+    def memory(self) -> float:
+        """Share that the leaky mean of past commands keeps at a step; 0 where the latent holds none."""
+        return COMMAND_MEMORY if self.config.command_dims else 0.0
 
     def to_env(self, action: Tensor) -> np.ndarray:
         """Actions `[*, A]` in [-1, 1] to float32 in the environment's bounds."""
@@ -174,7 +184,7 @@ class LatentModel(nn.Module):
         """Environment actions `[*, A]` to [-1, 1]."""
         return ((action - self.action_low) / (self.action_high - self.action_low) * 2 - 1).clamp(-1, 1)
 
-    def search_fns(self, neighbour_distance_factor: float = 3.0, hidden: Precision | None = None) -> dict[str, Any]:
+    def search_fns(self, hidden: Precision | None = None) -> dict[str, Any]:
         """The callables that the search needs (fields of `velap.search.types.SearchFns`), equal to the methods above but
         without the module machinery; refuses a model in train mode. Build them anew after loading weights.
 
@@ -188,9 +198,9 @@ class LatentModel(nn.Module):
             **self._fast_functions(hidden),
             "project": self._fast_project() if self.config.bank_size else None,
             "rollout": self._fast_rollout(),
-            "noise_dim": self.config.noise_dim,
+            "noise_dim": NOISE_DIM,
             "discount": self.discount,
-            "d_neigh": neighbour_distance_factor * step_distance,
+            "d_neigh": NEIGHBOUR_DISTANCE * step_distance,
             "step_distance": step_distance,
         }
 
@@ -257,69 +267,3 @@ class LatentModel(nn.Module):
         return project
 
 
-MODEL_FORMAT = "velap-latent-model/1"
-WEIGHTS_SHA256 = "weights_sha256"
-"""Metadata key: hash of weights and config alone, the same for the same training however long it took."""
-SHARED_SHA256 = "shared_sha256"
-"""Metadata key: hash of the weights that heads and other methods share; see `shared_weights`."""
-OWN_WEIGHTS = ("success_policy.", "held_policy.", "bank_")
-"""Weights that VELAP's tree and controller alone act by."""
-
-
-def shared_weights(metadata: Mapping[str, str]) -> str:
-    """What heads and the records of other methods name of a joint checkpoint: the weights without VELAP's own.
-
-    Planner, controller and VELAP's own policies may then change beside them. Older files have the hash of everything.
-    """
-    return metadata.get(SHARED_SHA256, metadata.get(WEIGHTS_SHA256, "none"))
-
-
-def save_checkpoint(path: Path, model: LatentModel, config: Config, provenance: Mapping[str, str]) -> str:
-    """One safetensors file with weights, config and provenance (command, seed, dataset hash); returns its SHA-256."""
-    weights = model.state_dict()
-    if config.model.half_weights:
-        weights = {name: value.half() if value.dtype == torch.float32 and value.dim() > 1 else value
-                   for name, value in weights.items()}
-    shared = {name: value for name, value in weights.items() if not name.startswith(OWN_WEIGHTS)}
-    metadata = {
-        **provenance,
-        WEIGHTS_SHA256: content_sha256(weights, {"config": config.to_json()}),
-        SHARED_SHA256: content_sha256(shared, {"config": config.shared_json()}),
-        "format": MODEL_FORMAT,
-        "config": config.to_json(),
-        "spaces": json.dumps(dataclasses.asdict(model.spaces)),
-        "code_version": __version__,
-    }
-    return save_tensors(path, weights, metadata)
-
-
-def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tuple[LatentModel, Config, dict[str, str]]:
-    """Model in eval mode, its config and the metadata; raises CheckpointError on anything but an intact velap model."""
-    tensors, metadata = load_tensors(Path(path))
-    if metadata.get("format") != MODEL_FORMAT:
-        raise CheckpointError(
-            f"{path} has format {metadata.get('format')!r}; expected {MODEL_FORMAT!r}. "
-            "Give the `model.safetensors` of a run, not its training state."
-        )
-    config = Config.from_json(metadata["config"])
-    raw = json.loads(metadata["spaces"])
-    spaces = Spaces(raw["height"], raw["width"], tuple(raw["action_low"]), tuple(raw["action_high"]))
-    model = LatentModel(config.model, spaces, config.train.discount, config.train.precision)
-    restore(model, tensors, path)
-    return model.to(device).eval().requires_grad_(False), config, metadata
-
-
-def restore(module: nn.Module, tensors: Mapping[str, Tensor], path: Path | str) -> None:
-    """Load weights into a module built from the file's own config; raises CheckpointError where names or shapes differ."""
-    expected = module.state_dict()
-    wrong = sorted(
-        name
-        for name in expected.keys() | tensors.keys()
-        if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape
-    )
-    if wrong:
-        raise CheckpointError(
-            f"{path} does not fit its own config: {len(wrong)} tensors differ, {wrong[0]} first. "
-            "The file comes from another version of velap; train again."
-        )
-    module.load_state_dict(tensors)

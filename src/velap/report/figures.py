@@ -78,7 +78,7 @@ def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, *, fram
         actions.append(action)
     device = next(model.parameters()).device
     everything = np.stack(stacks)
-    share = 1 - model.config.command_memory**frame_stack  # of the one action in the leaky mean
+    share = 1 - model.memory**frame_stack  # of the one action in the leaky mean
     commands = share * model.to_unit(torch.from_numpy(np.stack(actions).astype(np.float32)).to(device))
     batches = zip(torch.from_numpy(everything).split(256), commands.split(256), strict=True)
     latents = torch.cat([model.encode(batch.to(device), before) for batch, before in batches])

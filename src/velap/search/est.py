@@ -129,7 +129,7 @@ def thresholds(cfg: PlannerConfig, discount: float, like: Tensor) -> Thresholds:
     values = (
         q_from_steps(cfg.discard_high_exponent, discount),
         q_from_steps(low, discount),
-        1 - discount if cfg.discard_std is None else cfg.discard_std,
+        1 - discount,
         q_from_steps(cfg.neighbour_exponent, discount),
         q_from_steps(cfg.goal_exponent, discount),
     )

@@ -11,6 +11,11 @@ from torch import Tensor
 from velap.config.planning import PlannerConfig
 from velap.search.types import RowGenerator
 
+TEMPERATURE_SPARSE = 1.0
+"""T_sparse of Eq. 6 [neighbours]. ours: the paper gives no number."""
+TEMPERATURE_VALUE = 0.1
+"""T_value of Eq. 7 [Q-value]. ours: the paper gives no number."""
+
 
 class Noise(NamedTuple):
     """Random numbers of n expansions."""
@@ -62,11 +67,11 @@ def node_distribution(crowding: Tensor, goal_values: Tensor, used: Tensor, cfg: 
         crowding: [B, N] n^neigh of Eq. 6, to which our presets add expansions made [neighbours].
         goal_values: [B, N] Q^g [Q-value], -inf on unused slots.
         used: [B, N] bool.
-        cfg: the mixture and its temperatures.
+        cfg: the mixture.
     """
-    logits = (crowding / -cfg.temperature_sparse).masked_fill_(~used, -torch.inf)
+    logits = (crowding / -TEMPERATURE_SPARSE).masked_fill_(~used, -torch.inf)
     sparse = logits.softmax(1, dtype=goal_values.dtype)
-    value = (goal_values / cfg.temperature_value).softmax(1)
+    value = (goal_values / TEMPERATURE_VALUE).softmax(1)
     mixture = cfg.p_sparse * sparse + cfg.p_value * value
     uniform_share = 1 - cfg.p_sparse - cfg.p_value
     return mixture + used * (uniform_share / used.sum(1, keepdim=True)) if uniform_share > 0 else mixture

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from velap.config.training import Precision
+from velap.config.planning import Precision
 from velap.errors import ConfigError
 from velap.search.types import SearchFns
 

@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from velap._version import __version__
 from velap.config import Config
 from velap.errors import ConfigError, VelapError
-from velap.models.velap import WEIGHTS_SHA256, LatentModel, load_checkpoint
+from velap.models.checkpoint import WEIGHTS_SHA256, load_checkpoint
+from velap.models.velap import LatentModel
 from velap.runs import storage_errors, write_atomic
 
 EXPORT_FORMAT = "velap-export/1"
@@ -155,7 +156,7 @@ def _describe(model: LatentModel, config: Config, metadata: Mapping[str, str],
         "format": EXPORT_FORMAT, "velap": __version__, "torch": torch.__version__, "task": config.task,
         "weights_sha256": metadata[WEIGHTS_SHA256], "frame_stack": config.model.frame_stack,
         "image_shape": [spaces.height, spaces.width, 3], "action_low": list(spaces.action_low),
-        "action_high": list(spaces.action_high), "command_memory": config.model.command_memory,
+        "action_high": list(spaces.action_high), "command_memory": model.memory,
         "reading": json.loads(metadata.get("reading", "null")),
         "programs": {name: asdict(program) for name, program in programs.items()},
     }

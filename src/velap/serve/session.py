@@ -18,7 +18,8 @@ from velap.data.images import MIN_SIDE, ImageLayout, to_rgb
 from velap.errors import ObservationError
 from velap.methods.base import Agent, get_method, make_agent
 from velap.methods.heads import head_path, load_head
-from velap.models.velap import WEIGHTS_SHA256, Spaces, load_checkpoint
+from velap.models.checkpoint import WEIGHTS_SHA256, load_checkpoint
+from velap.models.velap import Spaces
 from velap.training.loop import pick_device
 
 RESET, SEED = "reset", "seed"

@@ -14,7 +14,7 @@ from torch import Tensor
 from velap.data.sampling import WindowSampler
 from velap.models.horizon import steps_from_q
 from velap.models.velap import LatentModel
-from velap.training.latents import encode_all, encode_rows, evaluated
+from velap.training.encoding import encode_all, encode_rows, evaluated
 
 HORIZONS = (1, 3, 10)
 """Rollout lengths that are reported [steps]."""

@@ -21,11 +21,12 @@ from velap.data.frames import FrameStore
 from velap.data.sampling import WindowSampler
 from velap.errors import CheckpointError, ConfigError
 from velap.losses import Info
-from velap.models.velap import LatentModel, shared_weights
+from velap.models.checkpoint import shared_weights
+from velap.models.velap import LatentModel
 from velap.runs import load_tensors, make_generator, save_tensors
 from velap.training.capture import adam, set_rate
-from velap.training.latents import encode_all, evaluated
-from velap.training.loop import holdout_episodes
+from velap.training.encoding import encode_all, evaluated
+from velap.training.loop import HOLDOUT_EPISODES, holdout_episodes
 from velap.training.steps import cosine
 
 LATENTS = "latents.safetensors"
@@ -101,7 +102,7 @@ def latent_data(model: LatentModel, config: Config, metadata: Mapping[str, str],
 
     metadata: of the checkpoint; its seed decides which episodes are held out, as in the joint training.
     """
-    seed, count = int(metadata.get("seed", 0)), config.train.holdout_episodes
+    seed, count = int(metadata.get("seed", 0)), HOLDOUT_EPISODES
     device = next(model.parameters()).device
     sampler = WindowSampler(store, config.train, config.model.frame_stack, device, holdout_episodes(store, count, seed))
     inside = np.arange(len(store.frames)) < store.last
@@ -152,12 +153,11 @@ HeadT = TypeVar("HeadT", bound=nn.Module)
 class FrozenLearner(ABC, Generic[ConfigT, HeadT]):
     """Learns a head from cached latents: `update` draws a batch, takes the gradient of `loss` and lets the targets follow.
 
-    A `velap.training.state.Learner`, so it is saved and resumed as the joint training is.
+    What it saves: `model`, `companions` and `optimizers`.
     """
 
     def __init__(self, head: HeadT, data: LatentData, config: ConfigT, generator: torch.Generator) -> None:
         self.model, self.data, self.config, self.generator = head, data, config, generator
-        self.cache: Tensor | None = data.latents
         self.updates = 0
         self.companions: dict[str, nn.Module] = {}
         self.optimizers = {"head": self._adam(head)}
@@ -196,9 +196,6 @@ class FrozenLearner(ABC, Generic[ConfigT, HeadT]):
 
     def follow(self) -> None:
         """Let the target networks follow; there are none unless a learner makes some."""
-
-    def begin_latent_phase(self) -> None:
-        """Nothing is left to do: the latents were cached before the learner was made."""
 
     @torch.no_grad()
     def report(self) -> dict[str, float]:

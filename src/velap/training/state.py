@@ -1,10 +1,9 @@
-"""The state of a learner as one checksummed file: weights, targets, optimisers, generator. No pickle."""
+"""The state of a training as one checksummed file: networks, optimisers, generator. No pickle."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -12,87 +11,66 @@ from torch import Tensor, nn
 from velap.errors import CheckpointError
 from velap.runs import load_tensors, save_tensors
 
-STATE_FORMAT = "velap-training-state/1"
-SCHEDULE = "schedule"
-"""Metadata key of what has no effect before its phase begins: whoever resumes compares it."""
+STATE_FORMAT = "velap-training-state/2"
 
 
-class Learner(Protocol):
-    """What has a state: the joint learner, and those on frozen latents."""
-
-    generator: torch.Generator
-    updates: int
-    """Updates so far, for what happens every few of them."""
-    cache: Tensor | None
-    """float32 [F, D] latents of all frames once the encoder is frozen."""
-
-    @property
-    def model(self) -> nn.Module:
-        """What is learnt."""
-        ...
-
-    @property
-    def companions(self) -> Mapping[str, nn.Module]:
-        """Networks beside the model by name: targets, and what is thrown away after training."""
-        ...
-
-    @property
-    def optimizers(self) -> Mapping[str, torch.optim.Optimizer]:
-        """Optimisers by name."""
-        ...
-
-    def begin_latent_phase(self) -> None:
-        """Freeze the encoder and fill the cache, where that is still to do."""
-        ...
-
-
-def save_state(path: Path, learner: Learner, metadata: Mapping[str, str]) -> None:
+def save_state(path: Path, modules: Mapping[str, nn.Module], optimizers: Mapping[str, torch.optim.Optimizer],
+               generator: torch.Generator, metadata: Mapping[str, str]) -> None:
     """Write everything that a resume to the same bits needs, atomically."""
-    tensors = {f"model/{name}": value for name, value in learner.model.state_dict().items()}
-    for name, module in learner.companions.items():
-        tensors |= {f"target/{name}/{key}": value for key, value in module.state_dict().items()}
-    for name, optimizer in learner.optimizers.items():
+    tensors: dict[str, Tensor] = {}
+    for name, module in modules.items():
+        tensors |= {f"module/{name}/{key}": value for key, value in module.state_dict().items()}
+    for name, optimizer in optimizers.items():
         for index, moments in optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer/{name}/{index}/{key}": torch.as_tensor(value) for key, value in moments.items()}
-    tensors["generator"] = learner.generator.get_state()
-    progress = {"updates": str(learner.updates), "latent_phase": str(int(learner.cache is not None))}
-    save_tensors(path, tensors, {**metadata, **progress, "format": STATE_FORMAT})
+    tensors["generator"] = generator.get_state()
+    save_tensors(path, tensors, {**metadata, "format": STATE_FORMAT})
 
 
-def load_state(path: Path, learner: Learner, identity: Mapping[str, str]) -> dict[str, str]:
-    """Restore a learner and return the metadata; raises CheckpointError where `identity` differs from what was saved."""
-    tensors, metadata = load_tensors(path)
-    for key, value in {"format": STATE_FORMAT, **identity}.items():
-        if key != SCHEDULE and metadata.get(key) != value:
-            raise CheckpointError(
-                f"{path} was made with another {key}: it has {_short(metadata.get(key, 'none'), value)}, this command "
-                f"has {_short(value, metadata.get(key, ''))}. Resume with the same task, preset, seed and dataset, or "
-                "start a new run elsewhere with --out."
-            )
-    learner.model.load_state_dict(_under("model/", tensors))
-    if metadata["latent_phase"] == "1":
-        learner.begin_latent_phase()
-    for name, module in learner.companions.items():
-        kept = _under(f"target/{name}/", tensors)
-        if kept:  # what a phase to come needs did not exist when the state was written
-            module.load_state_dict(kept)
-    for name, optimizer in learner.optimizers.items():
-        _restore(optimizer, _under(f"optimizer/{name}/", tensors))
-    learner.generator.set_state(tensors["generator"])
-    learner.updates = int(metadata["updates"])
-    return metadata
+class SavedState:
+    """A state that was read; its parts go back where they came from, in any order."""
 
+    def __init__(self, path: Path) -> None:
+        """Raises CheckpointError for a file that is no state of today's format."""
+        self.path = path
+        self._tensors, self.metadata = load_tensors(path)
+        found = self.metadata.get("format")
+        if found != STATE_FORMAT:
+            raise CheckpointError(f"{path} has format {found!r}; expected {STATE_FORMAT!r}. An unfinished training of "
+                                  "another "
+                                  "version of velap goes on with that one; otherwise start a new run elsewhere with --out.")
 
-def _restore(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Moments `index/field` into the optimiser, with the strides of their parameter: the fused update walks memory."""
-    parameters = optimizer.param_groups[0]["params"]
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        index, field = key.split("/")
-        like = parameters[int(index)]
-        kept = torch.empty_like(like).copy_(value) if value.shape == like.shape else value
-        state.setdefault(int(index), {})[field] = kept
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    def require(self, identity: Mapping[str, str]) -> None:
+        """Raises CheckpointError where what must agree differs from what was saved."""
+        for key, value in identity.items():
+            saved = self.metadata.get(key, "none")
+            if saved != value:
+                raise CheckpointError(
+                    f"{self.path} was made with another {key}: it has {_short(saved, value)}, this command has "
+                    f"{_short(value, saved)}. Resume with the same task, preset, seed and dataset, or start a new run "
+                    "elsewhere "
+                    "with --out.")
+
+    def modules(self, modules: Mapping[str, nn.Module]) -> None:
+        """Load networks."""
+        for name, module in modules.items():
+            module.load_state_dict(_under(f"module/{name}/", self._tensors))
+
+    def optimizers(self, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+        """Load moments, with the strides of their parameter: the fused update walks memory."""
+        for name, optimizer in optimizers.items():
+            parameters = optimizer.param_groups[0]["params"]
+            state: dict[int, dict[str, Tensor]] = {}
+            for key, value in _under(f"optimizer/{name}/", self._tensors).items():
+                index, field = key.split("/")
+                like = parameters[int(index)]
+                kept = torch.empty_like(like).copy_(value) if value.shape == like.shape else value
+                state.setdefault(int(index), {})[field] = kept
+            optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+
+    def generator(self, generator: torch.Generator) -> None:
+        """Load random numbers."""
+        generator.set_state(self._tensors["generator"])
 
 
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

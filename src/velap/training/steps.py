@@ -1,5 +1,5 @@
-"""The one loop that steps through a training run: logs, TensorBoard, diagnostics, checkpoints, Ctrl-C, losses that are not
-finite. Joint training and the learners on frozen latents are driven by it."""
+"""The one loop that steps through a training: loggers, diagnostics, checkpoints, interrupts, losses that are not finite.
+Joint training and the learners on frozen latents are driven by it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 from velap.errors import TrainingError
-from velap.runs import MetricsLog
+from velap.training.loggers import Logger
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Progress:
     """What a progress view needs."""
 
     phase: str
-    """`joint` or `latent`, or the method whose head is learnt."""
+    """Stage of the training, or the method whose head is learnt."""
     step: int
-    """Updates done, both phases counted [steps]."""
+    """Updates done, all phases counted [steps]."""
     total: int
     """Updates of the whole run [steps]."""
     seconds: float
@@ -72,11 +72,6 @@ class Run(Protocol):
         """Where `save` puts the state."""
         ...
 
-    @property
-    def events_dir(self) -> Path:
-        """Folder of the TensorBoard events."""
-        ...
-
     def update(self) -> dict[str, Tensor]:
         """One update; adds one to `step`."""
         ...
@@ -90,12 +85,10 @@ class Run(Protocol):
         ...
 
 
-def run_steps(run: Run, log: MetricsLog, on_progress: Callable[[Progress], None], interrupted: threading.Event) -> None:
+def run_steps(run: Run, loggers: Sequence[Logger], on_progress: Callable[[Progress], None],
+              interrupted: threading.Event) -> None:
     """Update to the end or until interrupted; logs, diagnoses, saves, and raises TrainingError when a loss is not finite."""
-    from torch.utils.tensorboard import SummaryWriter
-
     every = run.cadence
-    writer = SummaryWriter(str(run.events_dir), purge_step=run.step)
     clock = time.monotonic()
     while run.step < run.total and not interrupted.is_set():
         info = run.update()
@@ -107,39 +100,45 @@ def run_steps(run: Run, log: MetricsLog, on_progress: Callable[[Progress], None]
             if bad:
                 kept = f"the last good state is in {run.state_path}" if run.state_path.exists() else "no state is kept yet"
                 raise TrainingError(f"{', '.join(bad)} became NaN or infinite at step {run.step}; expected finite losses. "
-                                    f"Check the data for bad actions, or lower the learning rate; {kept}.")
+                                    f"Check the data for bad actions and rewards; {kept}.")
         if run.step % every.diagnose == 0 or last:
             row |= run.report()
         now = time.monotonic()
         run.seconds, clock = run.seconds + now - clock, now
         if row:
-            log.append({"step": run.step, "phase": run.phase, "seconds": round(run.seconds, 1), **row})
-            for name, value in row.items():
-                writer.add_scalar(name, value, run.step)
+            for logger in loggers:
+                logger.log(run.step, run.phase, run.seconds, row)
             on_progress(Progress(run.phase, run.step, run.total, run.seconds, row))
         if run.step % every.checkpoint == 0:
             run.save()
-    writer.close()
+    for logger in loggers:
+        logger.close()
 
 
 @contextlib.contextmanager
 def interrupt_flag() -> Iterator[threading.Event]:
-    """Ctrl-C sets the flag instead of breaking an update in two; a second one raises at once."""
+    """Within, Ctrl-C (SIGINT) and SIGTERM set the flag instead of breaking an update in two; a second one acts at once.
+    Outside the main thread signals stay as they are."""
     flag = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield flag
         return
-    previous = signal.getsignal(signal.SIGINT)
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
     def note(number: int, frame: FrameType | None) -> None:
         flag.set()
-        signal.signal(signal.SIGINT, previous)
+        restore()
 
-    signal.signal(signal.SIGINT, note)
+    for number in previous:
+        signal.signal(number, note)
     try:
         yield flag
     finally:
-        signal.signal(signal.SIGINT, previous)
+        restore()
 
 
 def cosine(done: float) -> float:

@@ -16,7 +16,8 @@ from velap.config import Config, override
 from velap.data import minari_io
 from velap.errors import ConfigError, DatasetError
 from velap.evaluation.evaluate import Evaluation, Player, load_player
-from velap.models.velap import LatentModel, load_checkpoint
+from velap.models.checkpoint import load_checkpoint
+from velap.models.velap import LatentModel
 from velap.report.demo import released_checkpoint
 from velap.report.diagnose import figures
 from velap.report.diagnose.failures import Failures, watch

@@ -25,8 +25,8 @@ from velap.models.horizon import q_from_steps, steps_from_q
 from velap.models.inference import nearest_row
 from velap.models.velap import LatentModel
 from velap.training.diagnostics import Horizon
-from velap.training.latents import encode_rows
-from velap.training.loop import holdout_episodes
+from velap.training.encoding import encode_rows
+from velap.training.loop import HOLDOUT_EPISODES, holdout_episodes
 
 PAIRS = 1000
 """Pairs of states of other trajectories, of each kind. ours."""
@@ -88,7 +88,7 @@ def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, co
     if len(store.action_low) != model.action_dim:
         raise ConfigError(f"{dataset_id} has actions of {len(store.action_low)} entries, the checkpoint acts by "
                           f"{model.action_dim}; expected the same. Name the dataset that it was trained on with --dataset.")
-    kept = holdout_episodes(store, config.train.holdout_episodes, int(metadata.get("seed", 0)))
+    kept = holdout_episodes(store, HOLDOUT_EPISODES, int(metadata.get("seed", 0)))
     held_out = len(kept) > 0 or metadata.get("dataset_hash") != store.content_hash
     device = next(model.parameters()).device
     sampler = WindowSampler(store, config.train, config.model.frame_stack, device, kept)
@@ -103,9 +103,9 @@ def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, co
 
 
 @torch.inference_mode()
-def encode_states(model: LatentModel, sampler: WindowSampler, rows: NDArray[np.int64], chunk: int = 512) -> Tensor:
+def encode_states(model: LatentModel, sampler: WindowSampler, rows: NDArray[np.int64]) -> Tensor:
     """Latents [R, D] of the states at rows [R]."""
-    return encode_rows(model, sampler, torch.from_numpy(rows).to(sampler.device), chunk).float()
+    return encode_rows(model, sampler, torch.from_numpy(rows).to(sampler.device)).float()
 
 
 def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:

@@ -86,7 +86,7 @@ def grow(model: LatentModel, config: Config, starts: Starts, seeds: Sequence[int
     device = next(model.parameters()).device
     with torch.inference_mode():
         latents = model.encode(torch.from_numpy(starts.stacks).to(device)).float()
-    fns = SearchFns(**model.search_fns(config.planner.neighbour_distance_factor))
+    fns = SearchFns(**model.search_fns())
     return latents, plan(fns, latents, config.planner, [torch.Generator().manual_seed(seed) for seed in seeds])
 
 

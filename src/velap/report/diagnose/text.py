@@ -75,14 +75,14 @@ def _of_rollouts(rollout: RolloutError, simulated: int) -> Iterator[Check]:
         numbers=f"after {length} steps a rollout is {error:.2f} one-step lengths off; the state has moved {moved:.2f}",
         good=bool(error <= ERROR_SHARE * moved),
         expected=f"an error of at most {ERROR_SHARE:.0%} of the displacement",
-        advice="train longer (train.joint_steps, train.latent_steps), simulate fewer steps a node (planner.n_sim), or "
+        advice="train longer (train.joint.steps, train.latent.steps), simulate fewer steps a node (planner.n_sim), or "
                "check whether model.frame_stack frames show the whole state")
     steps = rollout.local_steps[1, at]
     yield Check(
         title="Q^l within a trajectory", numbers=f"states {length} steps apart are {steps:.1f} steps apart by Q^l (median)",
         good=bool(length / LOCAL_FACTOR / LOCAL_FACTOR <= steps <= length * LOCAL_FACTOR),
         expected=f"at most about {length}, since a random walk takes detours, and not near 0",
-        advice="near 0: distances have collapsed, raise train.c1; far above: train longer")
+        advice="near 0: distances have collapsed, raise train.joint.c1; far above: train longer")
 
 
 def _of_pairs(pairs: Sequence[StatePairs], limit: float) -> Iterator[Check]:
@@ -133,7 +133,7 @@ def _of_curves(curves: Sequence[ValueCurve]) -> Check:
         good=min(ends) >= 0.5 and min(rhos) >= RHO,
         expected=f"near 1 at the rewarded action, rho of {RHO} and more; far from the goal Q^g may flatten, the tree "
                  "searches there",
-        advice="low at the end: too few rewards seen, raise train.rewarded_share or add successes; flat: train longer")
+        advice="low at the end: too few rewards seen, raise train.joint.rewarded_share or add successes; flat: train longer")
 
 
 def _of_actions(actions: ActionValues) -> Check:
@@ -192,7 +192,7 @@ def _tree_advice(numbers: Sequence[TreeNumbers]) -> str:
     advice = {
         "unsupported": "most candidates leave the data: improve the dynamics, or set planner.anchor to none",
         "low": "most candidates are called too far from their parent: raise planner.discard_low_exponent, or check Q^l",
-        "std": "the ensemble disagrees on most candidates: raise planner.discard_std, or train longer",
+        "std": "the ensemble disagrees on most candidates: train longer",
         "high": "most candidates are near a node already: the reachable space is full, or Q^l takes different states for "
                 "one; see the share that counts as arrived",
     }[commonest]

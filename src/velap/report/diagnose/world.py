@@ -155,7 +155,7 @@ def expert_curves(model: LatentModel, env: gym.Env[Any, Any], frame_stack: int, 
         actions = torch.from_numpy(np.stack([*taken, np.zeros_like(taken[0])]).astype(np.float32)).to(device)
         with torch.inference_mode():
             commands = past_commands(model.to_unit(actions), torch.zeros(len(actions), dtype=torch.long, device=device),
-                                     model.config.command_memory)
+                                     model.memory)
             parts = zip(stacks.split(512), commands.split(512), strict=True)
             latents = torch.cat([model.encode(part.to(device), before) for part, before in parts]).float()
         curves.append(value_curve(model, f"expert from start {seed}", latents))

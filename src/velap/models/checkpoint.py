@@ -1,0 +1,91 @@
+"""Checkpoints: one safetensors file with weights, config and provenance."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from velap._version import __version__
+from velap.config import Config
+from velap.errors import CheckpointError
+from velap.models.velap import LatentModel, Spaces
+from velap.runs import content_sha256, load_tensors, save_tensors
+
+MODEL_FORMAT = "velap-latent-model/1"
+WEIGHTS_SHA256 = "weights_sha256"
+"""Metadata key: hash of weights and config alone, the same for the same training however long it took."""
+SHARED_SHA256 = "shared_sha256"
+"""Metadata key: hash of the weights that heads and other methods share; see `shared_weights`."""
+SHARED = ("encoder.", "command_weight", "action_", "dynamics.", "global_policy.", "global_critic.")
+"""Beginnings of the names of weights that heads and other methods act by: φ, g, h, π^g and Q^g; `action_` is g and the
+bounds."""
+HALF_ABOVE = 3_000_000
+"""Weights larger than this are stored in half precision, which keeps a released file below it [bytes]. ours."""
+
+
+def shared_weights(metadata: Mapping[str, str]) -> str:
+    """Hash of what heads and other methods act by, which their files and records name. The first files have one hash
+    only."""
+    return metadata.get(SHARED_SHA256, metadata.get(WEIGHTS_SHA256, "none"))
+
+
+def make_model(config: Config, spaces: Spaces) -> LatentModel:
+    """The model of a config with fresh weights."""
+    train = config.train
+    return LatentModel(config.model, spaces, train.discount, clones=train.clones, holds=train.holds)
+
+
+def save_checkpoint(path: Path, model: LatentModel, config: Config, provenance: Mapping[str, str]) -> str:
+    """One safetensors file with weights, config and provenance (command, seed, dataset hash); returns its SHA-256."""
+    weights = model.state_dict()
+    if sum(value.nbytes for value in weights.values()) > HALF_ABOVE:
+        weights = {name: value.half() if value.dtype == torch.float32 and value.dim() > 1 else value
+                   for name, value in weights.items()}
+    shared = {name: value for name, value in weights.items() if name.startswith(SHARED)}
+    metadata = {
+        **provenance,
+        WEIGHTS_SHA256: content_sha256(weights, {"config": config.hash()}),
+        SHARED_SHA256: content_sha256(shared, {"model": json.dumps(dataclasses.asdict(config.model), sort_keys=True)}),
+        "format": MODEL_FORMAT,
+        "config": config.to_json(),
+        "spaces": json.dumps(dataclasses.asdict(model.spaces)),
+        "code_version": __version__,
+    }
+    return save_tensors(path, weights, metadata)
+
+
+def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tuple[LatentModel, Config, dict[str, str]]:
+    """Model in eval mode, its config and the metadata; raises CheckpointError on anything but an intact velap model."""
+    tensors, metadata = load_tensors(Path(path))
+    if metadata.get("format") != MODEL_FORMAT:
+        raise CheckpointError(
+            f"{path} has format {metadata.get('format')!r}; expected {MODEL_FORMAT!r}. "
+            "Give the `model.safetensors` of a run, not its training state."
+        )
+    config = Config.from_json(metadata["config"])
+    raw = json.loads(metadata["spaces"])
+    spaces = Spaces(raw["height"], raw["width"], tuple(raw["action_low"]), tuple(raw["action_high"]))
+    model = make_model(config, spaces)
+    restore(model, tensors, path)
+    return model.to(device).eval().requires_grad_(False), config, metadata
+
+
+def restore(module: nn.Module, tensors: Mapping[str, Tensor], path: Path | str) -> None:
+    """Load weights into a module built from the file's own config; raises CheckpointError where names or shapes differ."""
+    expected = module.state_dict()
+    wrong = sorted(
+        name
+        for name in expected.keys() | tensors.keys()
+        if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape
+    )
+    if wrong:
+        raise CheckpointError(
+            f"{path} does not fit its own config: {len(wrong)} tensors differ, {wrong[0]} first. "
+            "The file comes from another version of velap; train again."
+        )
+    module.load_state_dict(tensors)

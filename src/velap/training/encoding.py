@@ -1,0 +1,48 @@
+"""Latents of a dataset's rows. M rows, F frames of the dataset, D latent, A action dimension."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from velap.data.sampling import WindowSampler
+from velap.models.velap import LatentModel
+
+
+@contextmanager
+def evaluated(*modules: nn.Module) -> Iterator[None]:
+    """Within, modules use running statistics (BatchNorm): targets, and critics under the policy loss."""
+    trained = [module for module in modules if module.training]
+    for module in trained:
+        module.eval()
+    try:
+        yield
+    finally:
+        for module in trained:
+            module.train()
+
+
+def commands_before(model: LatentModel, sampler: WindowSampler, rows: Tensor) -> Tensor | None:
+    """What the model remembers of the actions before rows: int64 [M] -> [M, A]; None for a model without commands."""
+    return sampler.commands(rows, model.memory) if model.memory > 0 else None
+
+
+def encode_rows(model: LatentModel, sampler: WindowSampler, rows: Tensor, chunk: int = 1024) -> Tensor:
+    """Latents of rows of the dataset: int64 [M] -> [M, D]."""
+    parts = rows.split(chunk)
+    return torch.cat([model.encode(sampler.stacks(part), commands_before(model, sampler, part)) for part in parts])
+
+
+@torch.no_grad()
+def encode_all(model: LatentModel, sampler: WindowSampler, features: Tensor | None = None) -> Tensor:
+    """Latents of every frame of the dataset, float32 [F, D], running statistics; `features` [F, ...] of the frames, where
+    they were measured before."""
+    rows = torch.arange(len(sampler.frames), device=sampler.device)
+    with evaluated(model):
+        measured = model.encoder.measure(sampler.frames) if features is None else features
+        parts = rows.split(model.encoder.chunk)
+        seen = torch.cat([model.encoder.encode(measured[sampler.stack_rows(part)]) for part in parts])
+        return model.with_commands(seen, commands_before(model, sampler, rows))
