@@ -1,4 +1,5 @@
-"""What a stranger adds from outside the package, in a file of some thirty lines each: a task, a planner and a baseline.
+"""What a stranger adds from outside the package, in a file of some thirty lines each: a task, an encoder, a planner and a
+baseline.
 
 The task comes from an installed package's entry point, as every package with a `velap.tasks` group; the others from modules
 that were imported. Each one is trained with and evaluated.
@@ -13,12 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import velap
 from velap.cli import main
 from velap.errors import UnknownTaskError
 from velap.evaluation.records import read_records
-from velap.registry import METHODS, PLANNERS, TASKS
+from velap.models.checkpoint import load_checkpoint
+from velap.registry import ENCODERS, METHODS, PLANNERS, TASKS
 from velap.runs import load_tensors
 from velap.tasks import get_task
 
@@ -51,13 +54,12 @@ def checkpoint(run: Path) -> Path:
     return run / "runs/Reach/default/seed0/model.safetensors"
 
 
-def evaluate(run: Path, method: str, *options: str) -> Path:
-    """The record file of two validation episodes from the command line."""
-    command = ["evaluate", "Reach", "--checkpoint", str(checkpoint(run)), "--method", method, "--episodes", "2",
-               "--first-seed", "1000", "--records", str(run / "records"), *options]
+def evaluate(run: Path, method: str, *options: str, of: Path | None = None) -> Path:
+    """The record file of two validation episodes from the command line, of the joint checkpoint or another one."""
+    command = ["evaluate", "Reach", "--checkpoint", str(of or checkpoint(run)), "--method", method, "--episodes", "2",
+               "--first-seed", "1000", "--records", str(run / "records"), "--fresh", *options]
     assert main(command) == 0
-    (path,) = (run / "records/Reach").glob(f"{method}-default/*.jsonl")
-    return path
+    return run / f"records/Reach/{method}-default/train0.jsonl"
 
 
 def test_a_task_of_an_installed_package_is_collected_trained_and_evaluated(run: Path) -> None:
@@ -71,11 +73,26 @@ def test_a_task_of_an_installed_package_is_collected_trained_and_evaluated(run: 
         get_task("Reich")
 
 
+def test_an_encoder_of_frozen_features_is_trained_with_and_evaluated(run: Path) -> None:
+    module = importlib.import_module("random_encoder")
+    assert main(["train", "Reach", "--out", "random", "--set", "model.encoder=random-features", *QUICK]) == 0
+    model, config, _ = load_checkpoint(run / "random/model.safetensors")
+    assert config.model.encoder == "random-features"
+    assert isinstance(model.encoder, module.RandomFeatures)
+    drawn = module.RandomFeatures(config.model, (64, 64)).weight
+    torch.testing.assert_close(model.encoder.weight, drawn)
+    records = read_records(evaluate(run, "velap", of=run / "random/model.safetensors"))
+    assert len(records) == 2 and all(record.steps == 40 or record.success for record in records)
+    ENCODERS.pop("random-features")
+    with pytest.raises(UnknownTaskError, match="unknown encoder 'random-features'; expected one of "):
+        load_checkpoint(run / "random/model.safetensors")
+
+
 def test_a_planner_is_used_by_velap_and_named_in_its_hash(run: Path) -> None:
     own = read_records(evaluate(run, "velap"))
     importlib.import_module("greedy_planner")
     assert list(PLANNERS) == ["est", "greedy"]
-    other = read_records(evaluate(run, "velap", "--set", "velap.planner=greedy", "--fresh"))
+    other = read_records(evaluate(run, "velap", "--set", "velap.planner=greedy"))
     assert all(len(record.plan_ms) > 0 for record in (*own, *other))
     assert other[0].config_hash != own[0].config_hash
     assert np.mean([record.plan_ms for record in other]) < np.mean([record.plan_ms for record in own])

@@ -12,7 +12,7 @@ from velap.training.frozen import FrozenLearner, LearnerConfig
 class LinearHead(Head):
     def __init__(self, config, action_dim):
         super().__init__(config, action_dim)
-        self.linear = nn.Linear(config.width(action_dim), action_dim)
+        self.linear = nn.Linear(self.latent_dim, action_dim)
 
     def act(self, latent):
         return self.linear(latent).tanh()

@@ -28,7 +28,7 @@ from velap.runs import content_sha256, load_tensors, save_tensors
 class Head(nn.Module, ABC):
     """Base of all heads. `method` and `settings` say what it is: they are kept in its file and enter record hashes.
 
-    A subclass takes the model's config and A: `Head(config, action_dim)`.
+    A subclass takes the model's config and A, `Head(config, action_dim)`, and finds D in `self.latent_dim`.
     """
 
     method: str = ""
@@ -41,6 +41,8 @@ class Head(nn.Module, ABC):
     @abstractmethod
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__()
+        self.latent_dim = latent_width(config, action_dim)
+        """D, what the joint model's latents hold in all."""
 
 
 class PolicyHead(Head):
@@ -48,7 +50,7 @@ class PolicyHead(Head):
 
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__(config, action_dim)
-        self.policy = Policy(latent_width(config, action_dim), POLICY, action_dim, config.norm)
+        self.policy = Policy(self.latent_dim, POLICY, action_dim, config.norm)
 
     def act(self, latent: Tensor) -> Tensor:
         """π: `[*, D] → [*, A]` in [-1, 1]."""

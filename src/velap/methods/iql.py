@@ -19,7 +19,6 @@ from velap.losses import Info, cloning_error, polyak, td_target
 from velap.methods.base import Agent, Method, Parts
 from velap.methods.heads import PolicyHead
 from velap.methods.reactive import ReactiveAgent
-from velap.models.encoders.base import latent_width
 from velap.models.networks import CRITIC, MLP, EnsembleMLP
 from velap.registry import register_method
 from velap.training.encoding import evaluated
@@ -78,8 +77,8 @@ class IQLHead(PolicyHead):
 
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__(config, action_dim)
-        self.critics = EnsembleMLP(N_CRITICS, latent_width(config, action_dim) + action_dim, CRITIC, config.norm)
-        self.value_net = MLP(latent_width(config, action_dim), CRITIC, 1, config.norm)
+        self.critics = EnsembleMLP(N_CRITICS, self.latent_dim + action_dim, CRITIC, config.norm)
+        self.value_net = MLP(self.latent_dim, CRITIC, 1, config.norm)
 
     def qs(self, latent: Tensor, action: Tensor) -> Tensor:
         """Q of every critic: `[*, D], [*, A] → [n, *]` [Q-value, in units of the learner's reward]."""

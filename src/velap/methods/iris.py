@@ -26,7 +26,6 @@ from velap.methods.base import Agent, Method, Parts
 from velap.methods.heads import Head
 from velap.methods.planning import PlanningAgent
 from velap.models.action_model import GENERATIVE, NOISE_DIM, ConditionalVAE
-from velap.models.encoders.base import latent_width
 from velap.models.networks import POLICY, Policy
 from velap.registry import register_method
 from velap.search.sampling import normal
@@ -89,7 +88,7 @@ class SubgoalHead(Head):
 
     def __init__(self, config: ModelConfig, action_dim: int) -> None:
         super().__init__(config, action_dim)
-        latent, norm = latent_width(config, action_dim), config.norm
+        latent, norm = self.latent_dim, config.norm
         self.manager = ConditionalVAE(latent, latent, NOISE_DIM, GENERATIVE, norm, bounded=False)
         self.worker = Policy(2 * latent, POLICY, action_dim, norm)
         self.register_buffer("steps_ahead", torch.tensor(0))
