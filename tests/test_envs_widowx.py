@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -140,6 +141,19 @@ def test_frames_have_shadows(sponge):
     with_shadows, without = (Renderer(sponge.model, 64, side).draw(sponge.model, sponge.data) for side in (128, 0))
     darker = with_shadows.astype(int).sum(-1) < without.astype(int).sum(-1) - 60
     assert 0.02 < darker.mean() < 0.4
+
+
+@pytest.mark.parametrize("kind", [Sponge, Rope])
+def test_a_core_makes_200_steps_a_second_with_pixels(kind):
+    """Processor time of this process, best of some rounds, so that other processes hardly matter."""
+    task, rng, rounds = kind(), np.random.default_rng(0), []
+    task.reset(seed=1000)
+    for _ in range(6):
+        began = time.process_time()
+        for _ in range(50):
+            task.step(rng.uniform(-1, 1, 4).astype(np.float32))
+        rounds.append((time.process_time() - began) / 50)
+    assert min(rounds[1:]) < 0.005
 
 
 @pytest.mark.parametrize("seed", range(1000, 1005))

@@ -91,7 +91,7 @@ class Rope(WidowXTask):
     """Done when the rope is off the pole and its held end on the region. A context is a place of pole and clamp."""
 
     assets: ClassVar[str] = "widowx rope"
-    view: ClassVar[View] = View(position=(0.60, 0.06, 0.54), target=(0.25, 0.0, 0.02), fovy=30.0)
+    view: ClassVar[View] = View(position=(0.60, 0.06, 0.54), target=(0.25, -0.01, 0.02), fovy=31.5)
     _corners: Vector
     """Of the rope when it is laid, from the foot of the pole [S + 1, 3] [m]."""
     low, high = np.array([0.15, -0.12, 0.025]), np.array([0.36, 0.13, 0.07])

@@ -38,7 +38,7 @@ class Sponge(WidowXTask):
     """Done when the sponge's centre is over the marked region. A context is a pose of the sponge."""
 
     assets: ClassVar[str] = "widowx sponge"
-    view: ClassVar[View] = View(position=(0.60, 0.06, 0.54), target=(0.225, 0.0, 0.02), fovy=37.0)
+    view: ClassVar[View] = View(position=(0.60, 0.06, 0.54), target=(0.225, -0.01, 0.02), fovy=38.0)
     low, high = np.array([0.17, -0.18, 0.025]), np.array([0.32, 0.18, 0.11])
 
     @classmethod
