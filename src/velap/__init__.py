@@ -13,17 +13,46 @@ from velap.registry import register_encoder, register_method, register_planner, 
 
 if TYPE_CHECKING:
     from velap.api import evaluate, load, make_dataset, train
+    from velap.config import (
+        ClonePhase,
+        Config,
+        ControllerConfig,
+        EncoderPhase,
+        EnsemblePhase,
+        JointPhase,
+        LatentPhase,
+        ModelConfig,
+        PlannerConfig,
+        TrainConfig,
+        ValuePhase,
+    )
+    from velap.data.frames import FrameStore
+    from velap.models.velap import LatentModel
+    from velap.tasks import make_config
+
+_HOMES = {
+    "velap.api": ("evaluate", "load", "make_dataset", "train"),
+    "velap.config": ("ClonePhase", "Config", "ControllerConfig", "EncoderPhase", "EnsemblePhase", "JointPhase",
+                     "LatentPhase", "ModelConfig", "PlannerConfig", "TrainConfig", "ValuePhase"),
+    "velap.data.frames": ("FrameStore",),
+    "velap.models.velap": ("LatentModel",),
+    "velap.tasks": ("make_config",),
+}
+"""Modules of the names that load on first use."""
 
 __all__ = [
-    "__version__", "evaluate", "load", "make_dataset", "register_encoder", "register_method", "register_planner",
-    "register_reader", "register_task", "train",
+    "ClonePhase", "Config", "ControllerConfig", "EncoderPhase", "EnsemblePhase", "FrameStore", "JointPhase", "LatentModel",
+    "LatentPhase", "ModelConfig", "PlannerConfig", "TrainConfig", "ValuePhase", "__version__", "evaluate", "load",
+    "make_config", "make_dataset", "register_encoder", "register_method", "register_planner", "register_reader",
+    "register_task", "train",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'velap' has no attribute {name!r}; it has {', '.join(__all__)}")
-    return getattr(import_module("velap.api"), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(home), name)
+    raise AttributeError(f"module 'velap' has no attribute {name!r}; it has {', '.join(__all__)}")
 
 
 def __dir__() -> list[str]:

@@ -5,6 +5,13 @@
     agent = velap.load(checkpoint)
     action = agent.act(frames)          # uint8 [B, N, H, W, 3] -> float32 [B, A]
     print(velap.evaluate("SpiralMaze", checkpoint, episodes=100).success_rate)
+
+The same with objects instead of names:
+
+    store = velap.FrameStore.from_episodes(episodes, action_low=-1, action_high=1)
+    checkpoint = velap.train(velap.make_config("my-robot"), store, out="runs/my-robot", loggers=["jsonl"])
+    model = velap.LatentModel.from_pretrained(checkpoint)
+    print(velap.evaluate(velap.load(checkpoint), env="my_package:Robot-v0", episodes=20).success_rate)
 """
 
 from __future__ import annotations
@@ -23,6 +30,7 @@ from velap.storage import OWN_RECORDS, run_dir
 from velap.tasks import TASKS, get_task, make_config, task_of
 
 if TYPE_CHECKING:
+    from velap.data.frames import FrameStore
     from velap.data.images import Fit
     from velap.data.success import Predicate
     from velap.evaluation.summary import Summary
@@ -59,8 +67,9 @@ def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwr
     return collect(get_task(task), seed=seed, workers=workers, overwrite=overwrite).dataset_id
 
 
-def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Path | None = None, *,
-          method: str = "velap", image_key: str | None = None, device: str = "auto", resume: bool = False,
+def train(source: str | Config, data: str | FrameStore | None = None, *, preset: str = "default", seed: int = 0,
+          out: Path | str | None = None, method: str = "velap", image_key: str | None = None, device: str = "auto",
+          resume: bool = False,
           changes: Changes | None = None, fit: Fit | None = None, image_size: int = 64,
           success: str | Predicate | None = None, mapped: bool | None = None, command: str = "velap.train",
           loggers: Sequence[str | Logger] = ("jsonl", "tensorboard"),
@@ -71,8 +80,9 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
     its latents lies beside it as `<method>.safetensors`, where `load` and `evaluate` find it.
 
     Args:
-        task_or_dataset: task name, path of a dataset, or its id.
-        preset: `default` or `paper`.
+        source: a config; or the name of a task, the path of a dataset or its id, which then has the preset's config.
+        data: with a config, the frames, or the path or id of their dataset.
+        preset: `default` or `paper`; a config has its own.
         seed: decides weights and batches.
         out: run directory; None takes `runs/<task>/<preset>/seed<seed>`.
         method: a name in `velap.registry.METHODS`.
@@ -88,6 +98,7 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
         loggers: names (`jsonl`, `tensorboard`, `wandb`) or objects with `log` and `close`.
         on_progress: called after every logged step.
     """
+    from velap.data.frames import FrameStore
     from velap.data.loading import load_store
     from velap.methods.base import get_method
     from velap.methods.learning import check_trainable, train_head
@@ -95,17 +106,20 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
     from velap.training.loop import train as run
 
     check_trainable(method)
-    task, changes = task_of(task_or_dataset), dict(changes or {})
+    changes = dict(changes or {})
     of_head = changes.pop("head", {})
+    config, data = _asked_for(source, data, preset, changes)
     kind = get_method(method)
-    learner = kind.learner_config(preset, of_head) if kind.learns or of_head else None
-    config = config_for(task, preset, changes)
-    dataset_id = TASKS[task_or_dataset].dataset_id if task_or_dataset in TASKS else task_or_dataset
-    store = load_store(dataset_id, image_key, DYNAMICS_HORIZON, image_size, fit=fit, success=success, mapped=mapped)
-    directory = out or run_dir(task, preset, seed)
+    learner = kind.learner_config(config.preset, of_head) if kind.learns or of_head else None
+    if isinstance(data, FrameStore):
+        _refuse_with_frames(image_key=image_key, fit=fit, success=success, mapped=mapped)
+        store = data
+    else:
+        store = load_store(data, image_key, DYNAMICS_HORIZON, image_size, fit=fit, success=success, mapped=mapped)
+    directory = Path(out) if out is not None else run_dir(config.task, config.preset, seed)
     checkpoint = directory / MODEL
     if not kind.whole_checkpoint and checkpoint.exists():
-        _check_origin(checkpoint, task, preset, seed, changes)
+        _check_origin(checkpoint, config, seed, changes)
     elif not (resume and _is_finished(checkpoint, config, seed, store.content_hash)):
         run(config, store, directory, seed=seed, device=device, resume=resume, command=command, loggers=loggers,
             on_progress=on_progress)
@@ -115,12 +129,35 @@ def train(task_or_dataset: str, preset: str = "default", seed: int = 0, out: Pat
     return checkpoint
 
 
-def _check_origin(checkpoint: Path, task: str, preset: str, seed: int, changes: Changes) -> None:
+def _asked_for(source: str | Config, data: str | FrameStore | None, preset: str,
+               changes: Changes) -> tuple[Config, str | FrameStore]:
+    """The config with `changes`, and the frames or the id of their dataset; raises ConfigError where one of them is missing
+    or named twice."""
+    if isinstance(source, Config):
+        if data is None:
+            raise ConfigError("got a config and no data; expected a FrameStore, or the path or id of a dataset. Call "
+                              "velap.train(config, data).")
+        return override(source, **{part: dict(fields) for part, fields in changes.items()}), data
+    if data is not None:
+        raise ConfigError(f"got the data {source!r} and other data beside them; expected one of them, or a config first: "
+                          "velap.train(velap.make_config(...), data).")
+    return config_for(task_of(source), preset, changes), TASKS[source].dataset_id if source in TASKS else source
+
+
+def _refuse_with_frames(**options: Any) -> None:
+    """Raises ConfigError where something is said about reading data that are read already."""
+    said = [name for name, value in options.items() if value is not None]
+    if said:
+        raise ConfigError(f"got a FrameStore and {', '.join(said)}; expected them where the store is made: "
+                          "FrameStore.from_episodes or velap.data.loading.load_store.")
+
+
+def _check_origin(checkpoint: Path, asked_for: Config, seed: int, changes: Changes) -> None:
     """Raises ConfigError unless a joint checkpoint comes from this task, preset and seed and has the fields of `changes`."""
     from velap.models.checkpoint import load_checkpoint
 
     _, config, metadata = load_checkpoint(checkpoint)
-    found, asked = (config.task, config.preset, int(metadata["seed"])), (task, preset, seed)
+    found, asked = (config.task, config.preset, int(metadata["seed"])), (asked_for.task, asked_for.preset, seed)
     if found != asked:
         raise ConfigError(f"{checkpoint} has task, preset and seed {found}; expected {asked}. Name its own with "
                           "--preset and --seed, or another run directory with --out.")
@@ -162,7 +199,7 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
     return make_agent(method, model, config, gym.spaces.Box(bounds[0], bounds[1], dtype=np.float32), learnt)
 
 
-def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,
+def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,
              first_seed: int = 0, env: str | None = None, env_kwargs: Mapping[str, Any] | None = None,
              image_key: str | None = None, max_steps: int | None = None, success: str | None = None,
              records: Path | str = OWN_RECORDS, fresh: bool = False, batch: int = 10, device: str = "auto",
@@ -170,7 +207,8 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
     """Success rate and more over seeded test episodes; goes on where an earlier call with the same records stopped.
 
     Args:
-        task: task name; with `env`, any label.
+        task: task name; with `env`, any label. Or an agent: its episodes are then summarised and not recorded, and of the
+            arguments below only those of episodes and environment count.
         checkpoint: `model.safetensors` of a run; `random` needs none.
         method: a name in `velap.registry.METHODS`.
         episodes: number of episodes.
@@ -186,11 +224,15 @@ def evaluate(task: str, checkpoint: Path | str | None = None, *, method: str = "
         device: `auto`, `cpu` or `cuda`.
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
     """
-    from velap.evaluation.evaluate import Evaluation
+    from velap.evaluation.evaluate import Evaluation, play
     from velap.evaluation.evaluate import evaluate as run
     from velap.evaluation.summary import summarise
 
+    seeds = range(first_seed, first_seed + episodes)
+    if not isinstance(task, str):
+        return summarise(play(task, env, seeds, env_kwargs=env_kwargs, image_key=image_key, max_steps=max_steps,
+                              success=success, batch=batch))
     what = Evaluation(task, method=method, checkpoint=None if checkpoint is None else Path(checkpoint), env=env,
                       env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=max_steps,
                       success=success, device=device, head=None if head is None else Path(head))
-    return summarise(run(what, range(first_seed, first_seed + episodes), Path(records), fresh=fresh, batch=batch))
+    return summarise(run(what, seeds, Path(records), fresh=fresh, batch=batch))

@@ -90,8 +90,8 @@ def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None
     if kind.learns and not (directory / MODEL).exists():
         note(f"no joint checkpoint in {directory}; it is trained first")
     with TrainingBar(OUT) as view:
-        checkpoint = api.train(source, preset, seed, out, method=method, image_key=image_key, device=device, resume=resume,
-                               changes=changes, command=command(), on_progress=view, **(reading or {}))
+        checkpoint = api.train(source, preset=preset, seed=seed, out=out, method=method, image_key=image_key, device=device,
+                               resume=resume, changes=changes, command=command(), on_progress=view, **(reading or {}))
     say(f"checkpoint {checkpoint}")
     if kind.learns:
         result = read_result(head_path(checkpoint, method))

@@ -258,6 +258,45 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
         return select(file.records, seeds)
 
 
+def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str, Any] | None = None,
+         image_key: str | None = None, max_steps: int | None = None, success: str | None = None,
+         image_size: int = IMAGE_SIZE, batch: int = BATCH) -> list[Record]:
+    """Records of an agent's episodes, one a seed, which are kept nowhere.
+
+    Args:
+        agent: anything that acts as `velap.methods.base.Agent` does.
+        env: task name, or any Gymnasium id.
+        seeds: episode seeds; test seeds are 0 to 99.
+        env_kwargs: arguments of `gymnasium.make` besides the id.
+        image_key: key of the image in dict observations.
+        max_steps: time limit where the environment has none, or a shorter one [steps].
+        success: what success is, a rule of `velap.data.success`; None: the info's word, else a positive reward.
+        image_size: side of the images that the agent takes [px].
+        batch: environments at once.
+    """
+    if env is None:
+        raise ConfigError("got an agent and no environment; expected a task name or a Gymnasium id, such as "
+                          'velap.evaluate(agent, env="SpiralMaze").')
+    if len(seeds) == 0 or batch < 1:
+        raise ConfigError(f"got {len(seeds)} episodes in batches of {batch}; expected at least one of each.")
+    env_id = TASKS[env].env_id if env in TASKS else env
+    batch = min(batch, len(seeds))
+    envs = make_envs(lambda: make_env(env_id, env_kwargs), batch)
+    try:
+        key = RunKey(task=env, method=agent.method, preset="none", train_seed=0, env=env_id, config_hash="", checkpoint="",
+                     code_version=code_version(), env_kwargs=dict(env_kwargs or {}), image_key=image_key,
+                     max_steps=_time_limit(envs[0], max_steps), success_rule=success)
+        rule = None if success is None else Success.parse(success)
+        rollout = Rollout(envs, agent, FrameReader(envs[0], image_size, image_key, None), max_steps=key.max_steps,
+                          reset_options=reset_options(envs[0]), success=rule)
+        return [Record(**vars(key), episode_seed=each.seed, success=each.success, steps=each.steps,
+                       truncated=each.truncated, plan_ms=each.plan_ms, batch=batch, device="")
+                for each in sorted(rollout.run(seeds), key=lambda each: each.seed)]
+    finally:
+        for made in envs:
+            made.close()
+
+
 def to_record(player: Player, episode: Episode, batch: int) -> Record:
     """The record of an episode that ran with `batch` - 1 others, times rounded to microseconds."""
     return Record(**vars(player.key), episode_seed=episode.seed, success=episode.success, steps=episode.steps,
