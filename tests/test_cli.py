@@ -62,7 +62,7 @@ def untrained(path: Path, task: str = "SpiralMaze", side: int = 64, bound: float
     (["train", "SpiralMaze", "--dataset", "robot/pile-v0"], "expected one of them"),
     (["train", "--dataset", "robot/pile-v0"], "no Minari dataset 'robot/pile-v0'"),
     (["train", "SpiralMaze", "--set", "n_iter=3"], "expected PART.FIELD=VALUE"),
-    (["train", "SpiralMaze", "--set", "train.nothing=3"], "no field ['nothing']"),
+    (["train", "SpiralMaze", "--set", "train.nothing=3"], "no field 'nothing'"),
     (["train", "SpiralMaze", "--set", "train.joint.window=x"], "`train.joint.window` is 'x'; expected int"),
     (["evaluate", "SpiralMaze", "--method", "ppo"], "unknown method 'ppo'; expected one of bc, "),
     (["table"], "no records below"),

@@ -333,9 +333,9 @@ def until(condition: Callable[[], bool], limit: float = 20.0) -> None:
 
 
 def test_a_message_beyond_the_limit_ends_its_connection_alone(policy: Policy) -> None:
-    with served(policy, max_message=2000) as port, client_of(port) as good:
+    with served(policy, max_message=20_000) as port, client_of(port) as good:
         with client_of(port) as client:
-            client.send(bytes(2001))
+            client.send(bytes(20_001))
             with pytest.raises(ConnectionClosed) as caught:
                 client.recv(10)
             assert caught.value.rcvd is not None and caught.value.rcvd.code == 1009
