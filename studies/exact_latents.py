@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from velap.data.frames import FrameStore
 from velap.envs.protocol import WithTrueState
 from velap.errors import ConfigError
 from velap.evaluation.console import ProgressBar
-from velap.evaluation.evaluate import make_env, reset_options
+from velap.evaluation.evaluate import make_env
 from velap.evaluation.rollout import FrameReader, Rollout, make_envs
 from velap.methods.base import make_agent
 from velap.models.encoders.base import Encoder
@@ -66,13 +66,24 @@ def unpack(pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], int]:
     return np.ascontiguousarray(flat[..., 2 : 2 + 4 * entries]).view(np.float32), joints
 
 
+def without_drawing(task: Task, picture: Callable[[Any], NDArray[Any]]) -> gym.Env[Any, Any]:
+    """The task's environment with `picture(world)` in place of the frame that it would draw."""
+    kind: Any = type(make_env(task.env_id).unwrapped)
+
+    class Undrawn(kind):
+        def render(self, size: int = SIDE) -> NDArray[Any]:
+            return picture(self)
+
+    env: gym.Env[Any, Any] = Undrawn()
+    return env
+
+
 def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: ProgressBar | None = None) -> FrameStore:
     """The trajectories that `velap collect` records, step for step, with packed states in place of frames; `contexts` of
     them all where given."""
-    env: Any = make_env(task.env_id).unwrapped
-    if not isinstance(env.unwrapped, WithTrueState):
+    if not isinstance(make_env(task.env_id).unwrapped, WithTrueState):
         raise ConfigError(f"{task.name} tells no true state; expected one of the manipulation tasks.")
-    env.render = env.true_state  # what the data hold in place of frames
+    env: Any = without_drawing(task, lambda world: world.true_state())
     runs = []
     count = contexts or task.recipe.contexts
     for context in range(count):
@@ -156,14 +167,12 @@ def play(task: Task, model: LatentModel, config: Config, *, method: str, seeds: 
          view: ProgressBar | None = None) -> list[Any]:
     """Episodes of a method that sees packed states."""
     def make() -> gym.Env[Any, Any]:
-        env = make_env(task.env_id)
-        world: Any = env.unwrapped
-        world.render = lambda size=SIDE: pack(world.true_state(), len(world.joints))
-        return env
+        env = without_drawing(task, lambda world: pack(world.true_state(), len(world.joints)))
+        return gym.wrappers.TimeLimit(env, task.max_steps)
 
     envs = make_envs(make, min(BATCH, len(seeds)))
     agent = make_agent(method, model, config, envs[0].action_space)
-    rollout = Rollout(envs, agent, FrameReader(envs[0], SIDE), reset_options=reset_options(envs[0]))
+    rollout = Rollout(envs, agent, FrameReader(envs[0], SIDE), reset_options={"split": "test"})
     episodes = []
     for episode in rollout.run(seeds):
         episodes.append(episode)

@@ -403,3 +403,9 @@ def test_the_readme_quickstart_and_the_command_line_agree(capsys: pytest.Capture
     assert read_records(records) == before, "the run is finished: nothing is left to do"
     assert cli.main(["train", "SpiralMaze"]) == 2
     assert "--resume" in capsys.readouterr().err
+
+
+def test_a_device_that_velap_does_not_run_on_is_named(tmp_path: Path) -> None:
+    for device in ("mps", "quantum"):
+        with pytest.raises(ConfigError, match="expected auto, cpu or cuda"):
+            velap.load(untrained(tmp_path / "a.safetensors"), device=device)

@@ -284,6 +284,8 @@ def pick_device(device: str) -> torch.device:
         found = torch.device(device)
     except RuntimeError as error:
         raise ConfigError(f"unknown device {device!r}; expected auto, cpu or cuda.") from error
+    if found.type not in ("cpu", "cuda"):
+        raise ConfigError(f"device {device!r} is not supported; expected auto, cpu or cuda.")
     if found.type == "cuda" and not torch.cuda.is_available():
         raise ConfigError(f"device {device!r} was asked for and PyTorch finds no CUDA here. Use --device auto or cpu.")
     return found
