@@ -351,6 +351,7 @@ def test_the_table_of_all_records_has_whole_names_in_a_log_file(monkeypatch: pyt
     (["evaluate", "SpiralMaze", "--method", "random", "--episodes", "1", "--max-steps", "0"], "Give one with --max-steps"),
     (["demo", "SpiralMaze", "--checkpoint", "nothing"], "no checkpoint at nothing"),
     (["train", "--dataset", "a" * 260 + "-v0"], "velap: "),
+    (["bench", "--only", "nothing", "plan_latency_1"], "unknown benchmark nothing"),
 ])
 def test_wrong_input_is_one_paragraph(command: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(command) == 2

@@ -67,7 +67,7 @@ class Table1:
         shutil.rmtree(DONE, ignore_errors=True)
         failed = 1
         if to_do(self.cells, self.records, self.episodes, fresh=self.fresh):
-            failed = self._snakemake("--keep-going", "--quiet", "host")
+            failed = self._snakemake("--quiet", "host")
         if failed:  # the workflow's last job did not write it
             self.write(console)
         wrong = [f"{cell}: {self._state(cell)}" for cell in self.cells if self._state(cell) != "done"]
@@ -109,10 +109,10 @@ class Table1:
         threads = max(usable_cores() // self.jobs, 1)
         config = {"records": self.records, "episodes": self.episodes, "batch": self.batch, "page": self.page,
                   "threads": threads, "fresh": self.fresh, "only": self.only}
-        forced = [str(path) for cell in self.cells for path, _ in outdated(cell) if path == dataset_file(cell.task)]
+        old = {str(path) for cell in self.cells for path, _ in outdated(cell) if path == dataset_file(cell.task)}
+        forced = ["--forcerun", *sorted(old)] if old and self.fresh else []
         command = [sys.executable, "-m", "snakemake", "--snakefile", str(Path(__file__).with_name("Snakefile")),
-                   "--cores", str(self.jobs * threads), "--rerun-incomplete", "--rerun-triggers", "mtime", "--nolock",
-                   "--show-failed-logs", *options, *(["--forcerun", *sorted(set(forced))] if forced and self.fresh else []),
+                   "--cores", str(self.jobs * threads), "--nolock", *options, *forced,
                    "--config", *(f"{name}={value}" for name, value in config.items() if value != "")]
         with _alone() as lock, subprocess.Popen(command, start_new_session=True, pass_fds=(lock,)) as process:
             try:
