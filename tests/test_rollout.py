@@ -11,7 +11,7 @@ import pytest
 from toy_env import SIDE, ToyEnv, ToyModel, toy_config, toy_env
 from velap.data.success import Success
 from velap.errors import ConfigError, DatasetError
-from velap.evaluation.rollout import Episode, FrameReader, Rollout, make_envs
+from velap.evaluation.rollout import Episode, FrameReader, Moment, Rollout, make_envs
 from velap.methods.base import Agent, make_agent
 from velap.methods.random import RandomAgent
 
@@ -51,8 +51,8 @@ def test_actions_do_not_depend_on_the_batch() -> None:
     def positions(batch: int) -> dict[int, np.ndarray]:
         seen: dict[int, list[np.ndarray]] = {}
 
-        def watch(row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
-            seen.setdefault(seed, []).append(env.unwrapped.agent_position())  # type: ignore[attr-defined]
+        def watch(moment: Moment) -> None:
+            seen.setdefault(moment.seed, []).append(moment.env.unwrapped.agent_position())  # type: ignore[attr-defined]
 
         play(toy_agent(), range(5), batch, max_steps=15, observer=watch)
         return {seed: np.stack(path) for seed, path in seen.items()}

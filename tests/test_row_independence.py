@@ -11,7 +11,7 @@ import pytest
 from test_agents import round_the_wall
 from toy_env import SIDE, ToyEnv, ToyModel, draw, toy_config
 from velap.config import override
-from velap.evaluation.rollout import FrameReader, Rollout
+from velap.evaluation.rollout import FrameReader, Moment, Rollout
 from velap.methods.velap import VelapAgent
 
 STARTS = ((-6.0, 0.0), (-3.0, -7.0), (1.5, 0.5), (-1.0, 7.0), (4.0, -8.0), (-8.0, 5.0), (9.0, 3.0), (-6.0, -1.0))
@@ -51,7 +51,8 @@ def actions_of(agent: VelapAgent, seeds: tuple[int, ...], batch: int) -> tuple[d
     taken: dict[int, list[np.ndarray]] = {}
     modes: set[tuple[bool, ...]] = set()
 
-    def watch(row: int, seed: int, env: gym.Env[Any, Any], acting: object, outcome: object) -> None:
+    def watch(moment: Moment) -> None:
+        row = moment.row
         following = len(agent.plans.ahead(row)) > 0 and not agent.near_goal[row]
         modes.add((bool(row in agent.planned_rows), bool(agent.near_goal[row]), bool(agent.led[row]), following))
 

@@ -225,7 +225,7 @@ def _checked_actions(env: gym.Env[Any, Any], model: LatentModel | None) -> gym.s
 
 
 def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATCH, fresh: bool = False,
-             observer: Observer | None = None, on_record: Callable[[Record], None] = lambda record: None,
+             on_record: Callable[[Record], None] = lambda record: None,
              player: Player | None = None) -> list[Record]:
     """Run every seed that is not recorded yet and return the records of all `seeds`, in their order.
 
@@ -235,7 +235,6 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
         records: root of the record files.
         batch: environments at once.
         fresh: move an existing record file aside first.
-        observer: sees every state of the episodes that run now, for videos.
         on_record: called for every record, those found on disk first.
         player: `load_player(what)` where the caller has it already.
     """
@@ -251,7 +250,7 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
         missing = [seed for seed in seeds if seed not in file.done]
         if missing:
             batch = min(batch, len(missing))
-            for episode in player.rollout(batch, observer).run(missing):
+            for episode in player.rollout(batch).run(missing):
                 record = to_record(player, episode, batch)
                 file.append(record)
                 on_record(record)

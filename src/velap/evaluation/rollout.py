@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -38,12 +38,22 @@ class Episode:
     """Planning time of every plan of this row [ms]."""
 
 
-class Observer(Protocol):
-    """Sees every state of every running episode: each before its action, the last one with the episode's outcome."""
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """One state of a running episode: each before its action, and the last one."""
 
-    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
-        """Row and seed of the episode, its environment in the state at hand, the agent, the outcome at the end."""
-        ...
+    row: int
+    seed: int
+    """Of the episode."""
+    env: gym.Env[Any, Any]
+    """In this state."""
+    agent: Agent
+    outcome: Episode | None = None
+    """How the episode went, in its last state; None before."""
+
+
+Observer = Callable[[Moment], None]
+"""Sees every state of every running episode."""
 
 
 class FrameReader:
@@ -136,7 +146,7 @@ class Rollout:
         if np.isfinite(self._agent.last_plan_ms[index]):
             row.plan_ms.append(float(self._agent.last_plan_ms[index]))
         if self._observer is not None:
-            self._observer(index, row.seed, env, self._agent, None)
+            self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent))
         observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
         row.frames.append(self._read(observation))
         success = success_of(float(reward), info, self._success, bool(terminated))
@@ -146,7 +156,7 @@ class Rollout:
         gave_up = bool(out_of_time and not success and not terminated)
         outcome = Episode(row.seed, success, row.steps, gave_up, tuple(row.plan_ms))
         if self._observer is not None:
-            self._observer(index, row.seed, env, self._agent, outcome)
+            self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent, outcome=outcome))
         return outcome
 
 

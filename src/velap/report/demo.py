@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
@@ -14,9 +12,8 @@ from velap.errors import CheckpointError
 from velap.evaluation.console import EpisodeBar
 from velap.evaluation.evaluate import Evaluation, Player, load_player, to_record
 from velap.evaluation.records import Record
-from velap.evaluation.rollout import Episode
+from velap.evaluation.rollout import Moment
 from velap.evaluation.summary import Summary, summarise, summary_text
-from velap.methods.base import Agent
 from velap.methods.velap import VelapAgent
 from velap.report.figures import LatentMap, plan_figure
 from velap.report.video import VideoRecorder, latent_map_of, picture
@@ -34,12 +31,14 @@ class FirstPlan:
         self._seed = seed
         self._kept: tuple[NDArray[np.uint8], Plan, int] | None = None
 
-    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
+    def __call__(self, moment: Moment) -> None:
         """Keep the plan once, as soon as it is there."""
-        if self._kept is None and seed == self._seed and isinstance(agent, VelapAgent) and isinstance(agent.last_plan, Plan):
-            rows = np.flatnonzero(agent.last_plan_rows == row)
+        agent = moment.agent
+        wanted = self._kept is None and moment.seed == self._seed
+        if wanted and isinstance(agent, VelapAgent) and isinstance(agent.last_plan, Plan):
+            rows = np.flatnonzero(agent.last_plan_rows == moment.row)
             if len(rows):
-                self._kept = picture(env, PICTURE), agent.last_plan, int(rows[0])
+                self._kept = picture(moment.env, PICTURE), agent.last_plan, int(rows[0])
 
     def draw(self, latent_map: LatentMap, path: Path) -> bool:
         """Draw it into `path`; False where the episode had no plan."""
@@ -85,10 +84,10 @@ def _play(console: Console, player: Player, episodes: int, video: Path, latent_m
     records: list[Record] = []
     with EpisodeBar(console, "demo", episodes) as view, VideoRecorder(video, episodes, latent_map) as recorder:
 
-        def observe(row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
-            first_plan(row, seed, env, agent, outcome)
-            recorder(row, seed, env, agent, outcome)
-            view.step(row)
+        def observe(moment: Moment) -> None:
+            first_plan(moment)
+            recorder(moment)
+            view.step(moment.row)
 
         for episode in player.rollout(episodes, observe).run(range(episodes)):
             records.append(to_record(player, episode, episodes))

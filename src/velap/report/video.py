@@ -23,8 +23,7 @@ from velap.runs import storage_errors
 
 if TYPE_CHECKING:
     from velap.evaluation.evaluate import Player
-    from velap.evaluation.rollout import Episode
-    from velap.methods.base import Agent
+    from velap.evaluation.rollout import Moment
 
 TILE = 256
 """S [px]."""
@@ -64,21 +63,22 @@ class VideoRecorder:
         self._writer.send(None)
         return self
 
-    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
-        """Draw the tile of `row`; a frame is written whenever the rows come round again."""
+    def __call__(self, moment: Moment) -> None:
+        """Draw the tile of a row; a frame is written whenever the rows come round again."""
+        row, outcome = moment.row, moment.outcome
         if row <= self._last_row and outcome is None:
             self._write()
         self._last_row = row
-        text = f"episode {seed}, step {self._steps[row]}\n"
-        image = Image.fromarray(picture(env, TILE))
+        text = f"episode {moment.seed}, step {self._steps[row]}\n"
+        image = Image.fromarray(picture(moment.env, TILE))
         colour: tuple[int, int, int] = (0, 0, 0)
         if outcome is not None:
             text, colour = (f"{text}solved", _SOLVED) if outcome.success else (f"{text}not solved", _FAILED)
             self._steps[row] = 0
         else:
             self._steps[row] += 1
-            if isinstance(agent, VelapAgent):
-                text += self._draw_plan(image, agent, row)
+            if isinstance(moment.agent, VelapAgent):
+                text += self._draw_plan(image, moment.agent, row)
         caption = Image.new("RGB", (TILE, CAPTION), "white")
         ImageDraw.Draw(caption).text((6, 1), text, colour, font=self._font, spacing=2)
         y, x = row // self._columns * (TILE + CAPTION), row % self._columns * TILE

@@ -8,16 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from velap.envs.protocol import Measured, Positioned, WithObjects, WithSubtasks
 from velap.evaluation.evaluate import BATCH, Player
-from velap.evaluation.rollout import Episode
-from velap.methods.base import Agent
+from velap.evaluation.rollout import Moment
 from velap.methods.velap import VelapAgent
 from velap.report.diagnose.plans import FilmStrip
 
@@ -162,9 +159,10 @@ class Tracer:
         self._every = every
         """Steps between two kept frames [steps]."""
 
-    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
+    def __call__(self, moment: Moment) -> None:
         """One state of one episode."""
-        trace, world = self.traces.setdefault(seed, Trace(seed)), env.unwrapped
+        trace, world = self.traces.setdefault(moment.seed, Trace(moment.seed)), moment.env.unwrapped
+        agent, outcome = moment.agent, moment.outcome
         if isinstance(world, Positioned):
             trace.positions.append(world.agent_position())
         if isinstance(world, WithObjects):
@@ -177,11 +175,11 @@ class Tracer:
             trace.success, trace.steps = outcome.success, outcome.steps
         else:
             assert isinstance(agent, VelapAgent)
-            trace.values.append(float(agent.last_values[row]))
-            trace.near_goal.append(bool(agent.near_goal[row]))
+            trace.values.append(float(agent.last_values[moment.row]))
+            trace.near_goal.append(bool(agent.near_goal[moment.row]))
         step = len(trace.values) if outcome is not None else len(trace.values) - 1
         if outcome is not None or step % self._every == 0:
-            trace.shots.append((step, np.asarray(env.render(), np.uint8)))
+            trace.shots.append((step, np.asarray(moment.env.render(), np.uint8)))
 
 
 def failure_strip(trace: Trace, kind: str) -> FilmStrip:
