@@ -15,12 +15,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from studies.bake_meshes import SITES
 from velap.envs.pixels import FRAME_SIZE, Frame, shared_renderer
 from velap.envs.sawyer.scene import SHOWN_GROUPS, VIEW
 from velap.envs.sawyer.view import View
+from velap.evaluation.summary import markdown_rows
 from velap.runs import storage_errors
 from velap.tasks import get_task
 
@@ -128,9 +128,8 @@ def show_drawing(console: Console, path: Path) -> None:
     for task in TASKS:
         with console.status(f"drawing {task}"):
             comparisons.append(compare(task))
-    table = Table("task", "frames", "mean difference", "99th percentile", caption="of 255, 64 × 64 px, shadows off")
-    for found in comparisons:
-        table.add_row(found.task, str(len(found.ours)), f"{found.mean:.2f}", f"{found.percentile99:.0f}")
+    rows = [(found.task, str(len(found.ours)), f"{found.mean:.2f}", f"{found.percentile99:.0f}") for found in comparisons]
+    head = ("task", "frames", "mean difference (of 255, 64 × 64 px)", "99th percentile")
     drawing_figure(path, comparisons)
-    console.print(table)
+    console.print(markdown_rows(head, rows), markup=False, soft_wrap=True)
     console.print(f"picture {path}", markup=False)

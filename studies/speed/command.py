@@ -14,11 +14,11 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.table import Table
 
 from studies.speed import benchmarks
 from studies.speed.benchmarks import Measurement
 from velap.errors import ConfigError
+from velap.evaluation.summary import markdown_rows
 from velap.runs import write_atomic
 from velap.threads import usable_cores
 from velap.training.loop import pick_device
@@ -85,7 +85,7 @@ def run_benchmarks(console: Console, json_path: Path | None = None, device: str 
         with console.status(f"measuring {name}"):
             result = BENCHMARKS[name].measure(place)
         rows.append({"name": name, **asdict(result), "ratio": result.ratio, "machine": machine(place)})
-    console.print(table(rows))
+    console.print(table(rows), markup=False, soft_wrap=True)
     if json_path is not None:
         merged = {row["name"]: row for row in [*before, *rows]}
         write_atomic(json_path, (json.dumps(list(merged.values()), indent=1, ensure_ascii=False) + "\n").encode())
@@ -105,13 +105,14 @@ def _read(path: Path) -> list[dict[str, Any]]:
                           "file, or measure everything.") from error
 
 
-def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Rows of `run_benchmarks` for reading."""
-    view = Table("benchmark", "value", "reference", "ratio", "wanted", caption=rows[0]["machine"] if rows else None)
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Rows of `run_benchmarks` for reading, and the machine."""
+    lines = []
     for row in rows:
         ratio, reference = row["ratio"], row["reference_value"]
         shown = "-" if ratio is None else f"{ratio:.2f}" if ratio >= 0.1 else f"1/{1 / ratio:.0f}"
         number = "" if reference is None else f"{reference:.4g} {row['unit']}: "
-        view.add_row(row["name"], f"{row['value']:.4g} {row['unit']}", number + row["reference_name"], shown,
-                     BENCHMARKS[row["name"]].verdict(ratio))
-    return view
+        lines.append((row["name"], f"{row['value']:.4g} {row['unit']}", shown, BENCHMARKS[row["name"]].verdict(ratio),
+                      number + row["reference_name"]))
+    head = ("benchmark", "value", "ratio", "wanted", "reference")
+    return "\n".join([markdown_rows(head, lines), *dict.fromkeys(row["machine"] for row in rows)])
