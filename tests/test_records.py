@@ -25,7 +25,7 @@ KEY = RunKey(task="Maze", method="velap", preset="default", train_seed=0, env="v
 
 def record(seed: int, success: bool = True, steps: int = 10) -> Record:
     return Record(**vars(KEY), episode_seed=seed, success=success, steps=steps, truncated=not success, plan_ms=(1.5, 2.25),
-                  batch=1, device="cpu")
+                  plan_steps=None, batch=1, device="cpu")
 
 
 def filled(path: Path, count: int) -> bytes:

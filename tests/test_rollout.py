@@ -33,7 +33,9 @@ def test_velap_gets_round_the_wall_that_greed_cannot() -> None:
     assert all(episode.success and not episode.truncated for episode in solved.values())
     assert all(16 <= episode.steps <= 32 for episode in solved.values()), "the shortest way to the goal is 16 steps"
     assert all(len(episode.plan_ms) in (2, 3) for episode in solved.values()), "a plan every 10 steps until the goal is near"
+    assert all(10 <= episode.plan_steps < episode.steps for episode in solved.values()), "π^g takes the last steps"
     stuck = play(toy_agent("td3bc"), range(3), 3)
+    assert all(episode.plan_steps is None for episode in stuck.values()), "there is no tree"
     assert all(not episode.success and episode.truncated and episode.steps == 60 for episode in stuck.values())
     assert all(episode.plan_ms == () for episode in stuck.values())
 

@@ -66,7 +66,7 @@ def fill(cell: Cell, outcomes: Sequence[bool], *, config_hash: str | None = None
     with RecordFile(key.path(RECORDS), key) as file:
         for seed, success in enumerate(outcomes):
             file.append(Record(**vars(key), episode_seed=seed, success=success, steps=100 if success else 300,
-                               truncated=not success, plan_ms=plan_ms, batch=1, device="cpu"))
+                               truncated=not success, plan_ms=plan_ms, plan_steps=50, batch=1, device="cpu"))
     return key.path(RECORDS)
 
 
@@ -208,7 +208,7 @@ def test_cells_show_intervals_of_one_seed_and_the_spread_of_several() -> None:
     text = " ".join(tables.to_markdown(results.of("default")).split())
     assert "87.5 ± 17.7 (2 seeds)<br>paper 94 ± 3" in text and "**IQL (0.9 / 10)** | –<br>paper –" in text
     costs = tables.planning(results.of("default")).loc["SpiralMaze"]
-    assert tuple(costs)[:3] == ("2.0", "30.0", "40.0"), "medians 20 and 40; 95th percentiles 30 and 50"
+    assert tuple(costs)[:4] == ("2.0", "41.7", "30.0", "40.0"), "medians 20 and 40; 95th percentiles 30 and 50"
     rows = list(csv.DictReader(io.StringIO(tables.to_csv(results))))
     velap = [row for row in rows if (row["task"], row["method"]) == ("SpiralMaze", "velap")]
     assert [(row["train_seed"], row["success_percent"], row["mean_percent"], row["spread_percent"]) for row in velap] == [

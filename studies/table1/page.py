@@ -23,8 +23,8 @@ and training seed share one joint checkpoint (App. D)."""]
         parts.append(f"## {TITLES.get(preset, preset)}\n\n{to_markdown(runs)}")
         costs = planning(runs)
         if len(costs):
-            parts.append("VELAP, mean over its training seeds. An episode with fewer than one plan is mostly led by π^g or "
-                         f"by a cloned policy.\n\n{costs.to_markdown(disable_numparse=True)}")
+            parts.append("VELAP, mean over its training seeds. A step is led by a plan where its action follows an edge of "
+                         f"the current tree; records of schema 1 do not tell.\n\n{costs.to_markdown(disable_numparse=True)}")
     against = comparisons(results)
     if len(against):
         parts.append("## VELAP against the best baseline\n\nMcNemar's exact test, two-sided, on episodes of equal "

@@ -38,7 +38,7 @@ class Results:
 
     runs: pd.DataFrame
     """A row a training seed, and one without numbers for each cell that has no records; columns `CSV_COLUMNS`, `plans`,
-    `schema` and `outcomes`."""
+    `led_by_plan` [%], `schema` and `outcomes`."""
     notes: tuple[str, ...]
     """What was left out, and what is mixed."""
 
@@ -61,7 +61,7 @@ def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> 
             for method in METHOD_ORDER:
                 found = list(_runs(Cell(task, method, preset, 0), root, episodes, notes))
                 rows += found or [dict(zip(KEY, (task, method, preset), strict=True))]
-    runs = pd.DataFrame(rows, columns=[*CSV_COLUMNS, "plans", "schema", "outcomes"])
+    runs = pd.DataFrame(rows, columns=[*CSV_COLUMNS, "plans", "led_by_plan", "schema", "outcomes"])
     recorded = set(runs[runs["episodes"].notna()]["preset"])
     runs = runs[runs["preset"].isin(recorded | set(presets))].copy()
     for number, row in runs.iterrows():
@@ -95,7 +95,8 @@ def _runs(cell: Cell, root: Path, episodes: int, notes: list[str]) -> Iterator[d
             "mean_steps": summary.mean_steps, "plan_ms_p50": summary.plan_ms_p50, "plan_ms_p95": summary.plan_ms_p95,
             "training_seconds": training_seconds(run), "config_hash": records[0].config_hash,
             "checkpoint": records[0].checkpoint, "code_versions": " ".join(summary.code_versions), "records": str(path),
-            "plans": summary.mean_plans, "schema": min(record.schema for record in records),
+            "plans": summary.mean_plans,
+            "led_by_plan": 100 * summary.plan_share, "schema": min(record.schema for record in records),
             "outcomes": {(run.seed, record.episode_seed): record.success for record in records}}
 
 
@@ -161,9 +162,11 @@ def _latex(text: str) -> str:
 def planning(runs: pd.DataFrame) -> pd.DataFrame:
     """How much VELAP plans on each task of one preset, and what it costs; means over the training seeds."""
     velap = runs[(runs["method"] == "velap") & runs["episodes"].notna()]
-    means = velap.groupby("task")[["plans", "plan_ms_p50", "plan_ms_p95", "mean_steps", "training_seconds"]].mean()
+    columns = {"plans": "plans an episode", "led_by_plan": "steps led by a plan [%]", "plan_ms_p50": "plan p50 [ms]",
+               "plan_ms_p95": "plan p95 [ms]", "mean_steps": "steps an episode", "training_seconds": "training [min]"}
+    means = velap.groupby("task")[list(columns)].mean()
     means["training_seconds"] /= 60
-    means.columns = pd.Index(["plans an episode", "plan p50 [ms]", "plan p95 [ms]", "steps an episode", "training [min]"])
+    means = means.rename(columns=columns)
     means = means.reindex([task for task in TASK_ORDER if task in means.index])
     return means.map(lambda value: MISSING if pd.isna(value) else f"{value:.1f}")
 

@@ -299,7 +299,8 @@ def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str
 def to_record(player: Player, episode: Episode, batch: int) -> Record:
     """The record of an episode that ran with `batch` - 1 others, times rounded to microseconds."""
     return Record(**vars(player.key), episode_seed=episode.seed, success=episode.success, steps=episode.steps,
-                  truncated=episode.truncated, plan_ms=tuple(round(value, 3) for value in episode.plan_ms), batch=batch,
+                  truncated=episode.truncated, plan_ms=tuple(round(value, 3) for value in episode.plan_ms),
+                  plan_steps=episode.plan_steps, batch=batch,
                   device=player.device)
 
 

@@ -27,7 +27,8 @@ SCHEMA = 2
 IDENTITY = ("task", "method", "preset", "train_seed", "env", "env_kwargs", "image_key", "max_steps", "success_rule",
             "config_hash", "checkpoint")
 """Fields that every record of one file shares."""
-_NEW_IN_2: dict[str, Any] = {"env_kwargs": {}, "image_key": None, "success_rule": None, "batch": None, "device": None}
+_NEW_IN_2: dict[str, Any] = {"env_kwargs": {}, "image_key": None, "success_rule": None, "batch": None, "device": None,
+                             "plan_steps": None}
 """Fields that schema 1 did not have, with what its records stand for: no options, and an unknown batch and device."""
 
 
@@ -79,6 +80,8 @@ class Record(RunKey):
     """Ended by the time limit."""
     plan_ms: tuple[float, ...]
     """Every plan's time [ms]: its row's share of the batch that planned together."""
+    plan_steps: int | None
+    """Steps whose action followed an edge of the current tree [steps]; None for methods without a tree, and in schema 1."""
     batch: int | None
     """Environments that ran at once; None in records of schema 1."""
     device: str | None

@@ -19,7 +19,7 @@ from velap.data.frames import stack_indices
 from velap.data.images import Fit, find_image, to_rgb
 from velap.data.success import Success, success_of
 from velap.errors import ConfigError
-from velap.methods.base import Agent
+from velap.methods.base import Agent, FollowsTree
 
 NO_PIXELS = "make the environment with the argument that gives pixels, such as --env-kwargs obs_type=pixels"
 
@@ -36,6 +36,8 @@ class Episode:
     """Ended by the time limit without success."""
     plan_ms: tuple[float, ...]
     """Planning time of every plan of this row [ms]."""
+    plan_steps: int | None = None
+    """Steps whose action followed an edge of the current tree [steps]; None for agents without a tree."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +83,7 @@ class _Running:
     seed: int
     frames: list[NDArray[np.uint8]]
     plan_ms: list[float] = field(default_factory=list)
+    plan_steps: int | None = None
 
     @property
     def steps(self) -> int:
@@ -103,6 +106,7 @@ class Rollout:
                  success: Success | None = None, observer: Observer | None = None) -> None:
         self._envs = list(envs)
         self._agent = agent
+        self._tree = agent if isinstance(agent, FollowsTree) else None
         self._read = read
         self._options = reset_options
         self._max_steps = max_steps
@@ -121,7 +125,10 @@ class Rollout:
                 if row is not None:
                     stacks[index] = row.stacked(self._agent.frame_stack)
             actions = self._agent.act(np.stack(stacks))
+            by_plan = None if self._tree is None else self._tree.by_plan
             for index, row in enumerate(rows):
+                if row is not None and by_plan is not None:
+                    row.plan_steps = (row.plan_steps or 0) + int(by_plan[index])
                 episode = None if row is None else self._step(index, row, actions[index])
                 if episode is not None:
                     rows[index] = None
@@ -154,7 +161,7 @@ class Rollout:
         if not (success or terminated or out_of_time):
             return None
         gave_up = bool(out_of_time and not success and not terminated)
-        outcome = Episode(row.seed, success, row.steps, gave_up, tuple(row.plan_ms))
+        outcome = Episode(row.seed, success, row.steps, gave_up, tuple(row.plan_ms), row.plan_steps)
         if self._observer is not None:
             self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent, outcome=outcome))
         return outcome

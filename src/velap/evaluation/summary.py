@@ -39,6 +39,8 @@ class Summary:
     """Mean length of the successful episodes, NaN without any [steps]."""
     mean_plans: float
     """Mean number of plans an episode."""
+    plan_share: float
+    """Share of all steps whose action followed an edge of the current tree, NaN where it is not recorded [fraction]."""
     plan_ms_p50: float
     """Median planning time, NaN where nothing was planned [ms]."""
     plan_ms_p95: float
@@ -70,11 +72,17 @@ def summarise(records: Sequence[Record]) -> Summary:
         episodes=len(records), successes=successes, wilson_low=low, wilson_high=high,
         mean_steps=float(np.mean([record.steps for record in records])),
         mean_success_steps=float(np.mean(succeeded)) if succeeded else math.nan,
-        mean_plans=len(plans) / len(records),
+        mean_plans=len(plans) / len(records), plan_share=_plan_share(records),
         plan_ms_p50=float(np.percentile(plans, 50)) if len(plans) else math.nan,
         plan_ms_p95=float(np.percentile(plans, 95)) if len(plans) else math.nan,
         code_versions=tuple(sorted({record.code_version for record in records})),
     )
+
+
+def _plan_share(records: Sequence[Record]) -> float:
+    """Share of the steps led by a plan; NaN unless every record tells."""
+    led = [record.plan_steps for record in records if record.plan_steps is not None]
+    return sum(led) / sum(record.steps for record in records) if len(led) == len(records) else math.nan
 
 
 def mean_and_spread(rates: Sequence[float]) -> tuple[float, float]:

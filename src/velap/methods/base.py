@@ -10,7 +10,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,14 @@ class Agent(Protocol):
         A batch of another size than the last one starts new episodes in all rows.
         """
         ...
+
+
+@runtime_checkable
+class FollowsTree(Protocol):
+    """An agent that grows a tree and says which actions follow it."""
+
+    by_plan: NDArray[np.bool_]
+    """[B] rows whose last action followed an edge of the current tree."""
 
 
 @dataclass(frozen=True)

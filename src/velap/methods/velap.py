@@ -180,6 +180,11 @@ class VelapAgent:
         return self._led.cpu().numpy()
 
     @property
+    def by_plan(self) -> NDArray[np.bool_]:
+        """[B] rows whose last action followed an edge of their tree: π^l was on its way to a waypoint."""
+        return (~self._near_goal & ~self._led & (self.plans.length > 1)).cpu().numpy()
+
+    @property
     def global_policy(self) -> str:
         """What acts in place of π^g, in words."""
         return self._global_policy.name
