@@ -157,9 +157,9 @@ def test_checkpoints_of_another_config_are_outdated() -> None:
     assert look(cell, RECORDS, 4).problem == f"its `checkpoint` is 0123456789ab, that of today {weights[:12]}"
     save_untrained(cell.checkpoint, planner={"n_iter": 7})
     assert list(outdated(cell)) == [(cell.checkpoint, "the checkpoint holds another planner or controller than today's")]
-    save_untrained(cell.checkpoint, train={"c1": 0.5})
+    save_untrained(cell.checkpoint, train={"joint": {"c1": 0.5}})
     ((path, reason),) = outdated(cell)
-    assert path == cell.checkpoint.parent and "train.c1 is 0.5 there" in reason
+    assert path == cell.checkpoint.parent and "train.joint.c1 is 0.5 there" in reason
 
 
 # the tables

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 
 from studies.table1.paper import ROWS
 from studies.table1.paper import TASKS as PAPER_TASKS
-from velap.config import Config
+from velap.config import Config, describe
 from velap.data import minari_io
 from velap.errors import ConfigError, RecordError, UnknownTaskError
 from velap.evaluation.records import Record, read_records, record_path
@@ -252,11 +252,10 @@ def checkpoint_problem(cell: Cell, metadata: Mapping[str, str]) -> str:
         saved = Config.from_json(metadata.get("config", ""))
     except ConfigError as error:
         return f"the checkpoint cannot be read: {error}"
-    for part in ("model", "train"):
-        there, here = dataclasses.asdict(getattr(saved, part)), dataclasses.asdict(getattr(config, part))
-        for name in here:
-            if there[name] != here[name]:
-                return f"the checkpoint has another config: {part}.{name} is {there[name]!r} there and {here[name]!r} today"
+    if (saved.model, saved.train) != (config.model, config.train):
+        there, here = ({name: value for name, _, value, _ in describe(each)} for each in (saved, config))
+        name = next(name for name in here if there.get(name) != here[name])
+        return f"the checkpoint has another config: {name} is {there.get(name)} there and {here[name]} today"
     if None not in (dataset_hash, metadata.get("dataset_hash")) and metadata.get("dataset_hash") != dataset_hash:
         return "the checkpoint was trained on other data than the dataset that is there"
     return "" if saved == config else OTHER_PLANNER

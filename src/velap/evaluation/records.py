@@ -13,6 +13,7 @@ import os
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 from io import FileIO
 from pathlib import Path
 from typing import Any, Self
@@ -115,9 +116,14 @@ def _from_schema_1(raw: dict[str, Any]) -> dict[str, Any]:
     An episode that ran out of time tells the limit; for the others it is that of the task's environment, and unknown (None)
     for an environment of someone else.
     """
-    limits = {task.env_id: task.max_steps for task in TASKS.values()}
-    limit = raw.get("steps") if raw.get("truncated") else limits.get(raw.get("env", ""))
+    limit = raw.get("steps") if raw.get("truncated") else _time_limit_of(str(raw.get("env")))
     return {**raw, **_NEW_IN_2, "max_steps": limit, "schema": 1}
+
+
+@cache
+def _time_limit_of(env_id: str) -> int | None:
+    """The time limit of the task with that environment [steps]; None for an environment of someone else."""
+    return next((task.max_steps for task in TASKS.values() if task.env_id == env_id), None)
 
 
 def read_records(path: Path) -> list[Record]:
