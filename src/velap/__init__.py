@@ -26,7 +26,8 @@ if TYPE_CHECKING:
         TrainConfig,
         ValuePhase,
     )
-    from velap.data.frames import FrameStore
+    from velap.data.frames import Episode, FrameStore
+    from velap.data.loading import load_store
     from velap.models.velap import LatentModel
     from velap.tasks import make_config
 
@@ -34,18 +35,23 @@ _HOMES = {
     "velap.api": ("evaluate", "load", "make_dataset", "train"),
     "velap.config": ("ClonePhase", "Config", "ControllerConfig", "EncoderPhase", "EnsemblePhase", "JointPhase",
                      "LatentPhase", "ModelConfig", "PlannerConfig", "TrainConfig", "ValuePhase"),
-    "velap.data.frames": ("FrameStore",),
+    "velap.data.frames": ("Episode", "FrameStore"),
+    "velap.data.loading": ("load_store",),
     "velap.models.velap": ("LatentModel",),
     "velap.tasks": ("make_config",),
 }
 """Modules of the names that load on first use."""
 
 __all__ = [
-    "ClonePhase", "Config", "ControllerConfig", "EncoderPhase", "EnsemblePhase", "FrameStore", "JointPhase", "LatentModel",
-    "LatentPhase", "ModelConfig", "PlannerConfig", "TrainConfig", "ValuePhase", "__version__", "evaluate", "load",
-    "make_config", "make_dataset", "register_encoder", "register_method", "register_planner", "register_reader",
+    "ClonePhase", "Config", "ControllerConfig", "EncoderPhase", "EnsemblePhase", "Episode", "FrameStore", "JointPhase",
+    "LatentModel", "LatentPhase", "ModelConfig", "PlannerConfig", "TrainConfig", "ValuePhase", "__version__", "evaluate", "load",
+    "load_store", "make_config", "make_dataset", "register_encoder", "register_method", "register_planner", "register_reader",
     "register_task", "train",
 ]
+
+
+_HOMES = {"Episode": "velap.data.frames", "FrameStore": "velap.data.frames", "load_store": "velap.data.loading"}
+"""Modules of the names that do not lie in `velap.api`."""
 
 
 def __getattr__(name: str) -> Any:

@@ -51,7 +51,7 @@ def check_dataset_id(dataset_id: str) -> None:
     """Raise DatasetError unless Minari takes `dataset_id` as `(namespace/)name-v0`."""
     if not is_id(dataset_id):
         raise DatasetError(f"{dataset_id!r} is not a Minari dataset id; expected (namespace/)name-v0: letters, digits, "
-                           "- and _, and a version at the end, for example velap/SpiralMaze-v0.")
+                           "- and _, and a version at the end, for example velap/SpiralMaze-v0; or the path of a dataset.")
 
 
 def dataset_path(dataset_id: str) -> Path:

@@ -32,7 +32,9 @@ MOST_ROWS = 2048
 """Rows of a call up to which one thread of kernels.c is at least as fast as PyTorch on two cores. ours."""
 MOST_UNITS = 4096
 """Units of a layer up to which kernels.c is used: a block of rows has to fit on the stack. ours."""
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-shared", "-fPIC")
+# clang for ARM knows the processor by -mcpu alone
+TUNED = "-mcpu=native" if platform.machine().lower() in ("arm64", "aarch64") else "-march=native"
+FLAGS = ("-O3", TUNED, "-fno-math-errno", "-ffp-contract=fast", "-shared", "-fPIC")
 COMPILERS = ("cc", "gcc", "clang")
 _ADVICE = ("Install a compiler (Debian and Ubuntu: apt-get install gcc libc6-dev; macOS: xcode-select --install) or name "
            "one with CC; VELAP_NATIVE=0 silences this.")
