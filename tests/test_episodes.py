@@ -412,6 +412,14 @@ def test_float_images_are_rounded_by_the_bounds_of_their_space(low: float, high:
     np.testing.assert_array_equal(store.frames, np.concatenate(observations))
 
 
+@pytest.mark.parametrize(("high", "factor", "match"), [(1.0, 2.0, "to 2; expected 0 to 1"), (255.0, 1.0, "up to 1; "
+                          "expected values"),
+                                                       (1.0, np.nan, "from nan to nan")])
+def test_float_images_must_fit_the_bounds_of_their_space(high: float, factor: float, match: str):
+    frames = [(images / images.max() * factor).astype(np.float32) for images in noise((64, 64, 3))]
+    refused(stranger(frames, gym.spaces.Box(0.0, high, (64, 64, 3), np.float32)), match)
+
+
 @pytest.mark.parametrize("space", [gym.spaces.Box(-np.inf, np.inf, (64, 64, 3), np.float32),
                                    gym.spaces.Box(0, 1023, (64, 64, 3), np.uint16)])
 def test_images_of_other_numbers_are_refused(space: gym.spaces.Box):

@@ -43,15 +43,11 @@ _HOMES = {
 """Modules of the names that load on first use."""
 
 __all__ = [
-    "ClonePhase", "Config", "ControllerConfig", "EncoderPhase", "EnsemblePhase", "Episode", "FrameStore", "JointPhase",
-    "LatentModel", "LatentPhase", "ModelConfig", "PlannerConfig", "TrainConfig", "ValuePhase", "__version__", "evaluate", "load",
-    "load_store", "make_config", "make_dataset", "register_encoder", "register_method", "register_planner", "register_reader",
-    "register_task", "train",
+    "ClonePhase", "Config", "ControllerConfig", "EncoderPhase", "EnsemblePhase", "Episode", "FrameStore",
+    "JointPhase", "LatentModel", "LatentPhase", "ModelConfig", "PlannerConfig", "TrainConfig", "ValuePhase",
+    "__version__", "evaluate", "load", "load_store", "make_config", "make_dataset", "register_encoder",
+    "register_method", "register_planner", "register_reader", "register_task", "train",
 ]
-
-
-_HOMES = {"Episode": "velap.data.frames", "FrameStore": "velap.data.frames", "load_store": "velap.data.loading"}
-"""Modules of the names that do not lie in `velap.api`."""
 
 
 def __getattr__(name: str) -> Any:

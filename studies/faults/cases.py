@@ -186,6 +186,10 @@ CASES: tuple[Case, ...] = (
     Case("an action is infinite", TRAIN, "expected finite numbers",
          lambda place: as_stranger(place, put("actions", 1, np.inf))),
     Case("a reward is NaN", TRAIN, "expected finite numbers", lambda place: as_stranger(place, put("rewards", 1, np.nan))),
+    Case("float images that do not fill their bounds", TRAIN, "expected values up to 255",
+         lambda place: as_stranger(place, replace("observations", lambda images: images.astype(np.float32) / 255),
+                                   lambda m: m.update(observation_space=m["observation_space"].replace("uint", "float")
+                                                      .replace("float8", "float32")))),
     Case("no reward", TRAIN, "every reward of velap/SpiralMaze-v0 is 0", lambda place: as_stranger(place, _no_reward)),
     Case("episodes shorter than k", TRAIN, "longest episode",
          lambda place: as_stranger(place, shorten, lambda m: m.update(total_steps=2 * m["total_episodes"]))),

@@ -49,6 +49,18 @@ def _require_finite(values: np.ndarray, name: str, where: str) -> None:
                            "Repair the value or drop that episode, and write the dataset again.")
 
 
+def _require_bounds(images: np.ndarray, layout: ImageLayout, where: str) -> None:
+    """Raise DatasetError unless float images [T + 1, *] lie within their bounds, and exceed 1 where the upper one is 255."""
+    low, high = layout.bounds
+    found = float(images.min()), float(images.max())
+    if not (low - 0.01 <= found[0] and found[1] <= high + 0.01):
+        raise DatasetError(f"{where}: the images have values from {found[0]:g} to {found[1]:g}; expected {low:g} to "
+                           f"{high:g}, the bounds of their space. State the right bounds, and write the dataset again.")
+    if high == 255 and found[1] <= 1:
+        raise DatasetError(f"{where}: the images have values up to {found[1]:g}; expected values up to 255, the upper "
+                           "bound of their space. State 1 as the bound, and write the dataset again.")
+
+
 def checked_episode(episode: Episode, layout: ImageLayout, action_shape: tuple[int, ...], where: str) -> Episode:
     """The episode as arrays, shapes agreeing and values finite, missing rewards and flags filled in."""
     images, actions = np.asarray(episode.images), np.asarray(episode.actions)
@@ -64,6 +76,8 @@ def checked_episode(episode: Episode, layout: ImageLayout, action_shape: tuple[i
         raise DatasetError(f"{where}: the images are {images.dtype} of shape {images.shape}; expected {layout.dtype} "
                            f"of shape {(steps + 1, *layout.shape)}, one more than the {steps} rewards. Write that "
                            "episode again, its last observation included.")
+    if images.dtype != np.uint8:
+        _require_bounds(images, layout, where)
     if actions.shape != (steps, *action_shape):
         raise DatasetError(f"{where}: the actions have shape {actions.shape}; expected {(steps, *action_shape)}, one a "
                            "transition. Write that episode again.")
