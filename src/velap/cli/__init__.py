@@ -17,6 +17,7 @@ from velap._version import __version__
 from velap.cli.config import config
 from velap.cli.evaluate import demo, diagnose, evaluate
 from velap.cli.info import info
+from velap.cli.inspect import inspect, label
 from velap.cli.options import ERR, OUT, Settings, note, say
 from velap.cli.serve import export, serve
 from velap.cli.studies import bench, figure, study, table
@@ -28,6 +29,7 @@ __all__ = ["COMMANDS", "OUT", "Settings", "main"]
 COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": demo, "collect": collect, "train": train, "evaluate": evaluate, "run": run, "table": table, "bench": bench,
     "diagnose": diagnose, "study": study, "figure": figure, "config": config, "info": info, "serve": serve, "export": export,
+    "inspect": inspect, "label": label,
 }
 GREEDY = ("--set", "--only", "--env-kwargs")
 """Options that take several values of the form NAME=VALUE."""

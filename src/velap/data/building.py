@@ -59,7 +59,8 @@ class FrameBuffer:
 
 
 def build_store(name: str, episodes: Iterable[Episode], layout: ImageLayout, bounds: tuple[np.ndarray, np.ndarray],
-                reading: Reading, rule: Success | None = None, expected: int = 0, path: Path | None = None) -> FrameStore:
+                reading: Reading, rule: Success | None = None, expected: int = 0, path: Path | None = None,
+                need_success: bool = True) -> FrameStore:
     """A store of episodes whose images lie as `layout` says. Rewards become 0 and 1, an episode ends at its first success.
 
     Args:
@@ -72,6 +73,7 @@ def build_store(name: str, episodes: Iterable[Episode], layout: ImageLayout, bou
             higher of two rewards.
         expected: frames to make room for.
         path: file for the frames; None keeps them in memory.
+        need_success: whether data without any success are refused.
     """
     side = reading.image_size or (max if reading.fit == "pad" else min)(layout.sides)
     if layout.sides != (side, side):
@@ -87,7 +89,7 @@ def build_store(name: str, episodes: Iterable[Episode], layout: ImageLayout, bou
                                                                          episode.infos, where), number, where)
         if not parts.lengths:
             raise DatasetError(f"{name} has no episode; expected at least one. Collect some data into it.")
-        rule, won = parts.successes(rule, name)
+        told, won = parts.successes(rule, name) if need_success else parts.any_successes(rule, name)
         rows = parts.rows()
         kept = frames.finish()
     finally:
@@ -98,7 +100,7 @@ def build_store(name: str, episodes: Iterable[Episode], layout: ImageLayout, bou
     checks.check_ends(small["terminated"], small["truncated"], length, name)
     low, high = checks.bounded_actions(small["actions"], length, *bounds, name)
     return FrameStore.from_arrays(frames=kept[:count], **small, episode_length=length, action_low=low, action_high=high,
-                                  dataset_id=name, reading=replace(reading, image_size=side, success=str(rule)))
+                                  dataset_id=name, reading=replace(reading, image_size=side, success=told))
 
 
 class _Parts:
@@ -125,22 +127,29 @@ class _Parts:
                 found = Success("info", key).of_episode(number, episode.rewards, episode.terminated, episode.infos, where)
                 self._told[key].append(found)
 
-    def successes(self, rule: Success | None, name: str) -> tuple[Success, list[np.ndarray]]:
-        """The rule, found where none is given, and the successes bool [T] of each episode."""
+    def successes(self, rule: Success | None, name: str) -> tuple[str, list[np.ndarray]]:
+        """The rule's text, found where none is given, and the successes bool [T] of each episode."""
         if rule is not None:
             if not any(won.any() for won in self._won):
                 raise DatasetError(f"{name} has no success by the rule {rule}; expected at least one. Record some, or give "
                                    "another rule with --success.")
-            return rule, self._won
+            return str(rule), self._won
         for key, told in self._told.items():
             if len(told) == len(self.lengths) and any(won.any() for won in told):
-                return Success("info", key), told
+                return str(Success("info", key)), told
         rewards = [episode.rewards for episode in self._episodes]
         level = checks.level_rule(np.concatenate(rewards), name, sorted(self._names))
         if set(np.unique(np.concatenate(rewards))) != {0.0, 1.0}:
             other = min(float(part.min()) for part in rewards)
             checks.notice(f"{name}: reward {level:g} is read as success (1), {other:g} as 0.")
-        return Success("reward", least=level), [part >= level for part in rewards]
+        return str(Success("reward", least=level)), [part >= level for part in rewards]
+
+    def any_successes(self, rule: Success | None, name: str) -> tuple[str, list[np.ndarray]]:
+        """As `successes`; no rule and no success where there is none."""
+        try:
+            return self.successes(rule, name)
+        except DatasetError:
+            return "" if rule is None else str(rule), [np.zeros(length, bool) for length in self.lengths]
 
     def rows(self) -> dict[str, np.ndarray]:
         """Actions, rewards and flags by frame [F, *], zero in the row of each last frame."""

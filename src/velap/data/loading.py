@@ -72,7 +72,7 @@ def files_state(paths: list[Path]) -> str:
 
 def load_store(source: str | Path, image_key: str | None = None, min_length: int = 1, image_size: int | None = IMAGE_SIZE, *,
                fit: Fit | None = None, success: str | Success | Predicate | None = None,
-               mapped: bool | None = None) -> FrameStore:
+               mapped: bool | None = None, need_success: bool = True) -> FrameStore:
     """Read a dataset of images and continuous actions, ours or a stranger's, of any format that has a reader.
 
     Rewards become 0 and 1. An episode ends at its first success: what was recorded beyond is left out. Grey images are
@@ -88,6 +88,7 @@ def load_store(source: str | Path, image_key: str | None = None, min_length: int
         success: rule of `velap.data.success`; None finds one.
         mapped: map the frames from a file beside the dataset, which is made at the first call; None does so where they would
             take more than their share of memory.
+        need_success: whether a dataset without any success is refused, as training must.
 
     Raises:
         DatasetError: the dataset is missing, damaged or not of this kind; the text says the way out.
@@ -101,7 +102,8 @@ def load_store(source: str | Path, image_key: str | None = None, min_length: int
     side = image_size or max(layout.sides)
 
     def build(path: Path | None) -> FrameStore:
-        store = build_store(reader.name, reader.episodes(layout), layout, bounds, reading, rule, reader.frames, path)
+        store = build_store(reader.name, reader.episodes(layout), layout, bounds, reading, rule, reader.frames, path,
+                            need_success)
         if reader.content_sha256 is not None and layout.sides == (side, side) and rule is None \
                 and store.content_hash != reader.content_sha256:
             raise minari_io.damaged(reader.name, f"its arrays have SHA-256 {store.content_hash[:12]}…, not "
@@ -110,7 +112,7 @@ def load_store(source: str | Path, image_key: str | None = None, min_length: int
 
     if too_large(reader.frames, side) if mapped is None else mapped:
         labels = files_state([Path(rule.name)]) if rule is not None and rule.source == "labels" else ""
-        made_from = f"{reader.state()}; {reading.to_json()}; success {rule} {labels}"
+        made_from = f"{reader.state()}; {reading.to_json()}; success {rule} {labels}{'' if need_success else ' or none'}"
         try:
             store = open_mapped(reader.place, made_from) or build_mapped(build, reader.place, made_from)
         except DatasetError:
