@@ -22,6 +22,7 @@ from velap.cli.options import ERR, OUT, Settings, note, say
 from velap.cli.serve import export, serve
 from velap.cli.studies import bench, figure, study, table
 from velap.cli.train import collect, run, train
+from velap.cli.view import view
 from velap.errors import ConfigError, VelapError
 
 __all__ = ["COMMANDS", "OUT", "Settings", "main"]
@@ -29,7 +30,7 @@ __all__ = ["COMMANDS", "OUT", "Settings", "main"]
 COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": demo, "collect": collect, "train": train, "evaluate": evaluate, "run": run, "table": table, "bench": bench,
     "diagnose": diagnose, "study": study, "figure": figure, "config": config, "info": info, "serve": serve, "export": export,
-    "inspect": inspect, "label": label,
+    "inspect": inspect, "label": label, "view": view,
 }
 GREEDY = ("--set", "--only", "--env-kwargs")
 """Options that take several values of the form NAME=VALUE."""

@@ -69,6 +69,7 @@ class VelapAgent:
         """[B] steps since each row planned, n_replan where it has to [steps]."""
         self.plans = Plans(0, self._device)
         """What the rows follow."""
+        self._latents = torch.empty(0, 0)
         self._values, self._near_goal = torch.empty(0), torch.empty(0, dtype=torch.bool)
         self._led = torch.empty(0, dtype=torch.bool)
 
@@ -96,7 +97,7 @@ class VelapAgent:
         frames = self._states.checked(frames)
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
-        z = self._states(frames)  # Alg. 2, l. 2 and 12
+        self._latents = z = self._states(frames)  # Alg. 2, l. 2 and 12
         self._values = self._corrected(torch.arange(len(z), device=self._device)).value(z)
         for correction in self._corrections:
             correction.observe(z)
@@ -163,6 +164,11 @@ class VelapAgent:
         self.last_plan, self.last_plan_rows = found, planned
         self.plans.store(rows, found.waypoints, found.length)
         self._age[rows] = 0
+
+    @property
+    def last_latents(self) -> NDArray[np.float32]:
+        """[B, D] the last states."""
+        return self._latents.float().cpu().numpy()
 
     @property
     def last_values(self) -> NDArray[np.float32]:
