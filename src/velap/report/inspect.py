@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from velap.config.training import DYNAMICS_HORIZON
 from velap.data.card import dataset_card, draw_frames, episode_returns
 from velap.data.frames import FrameStore
 from velap.data.images import IMAGE_SIZE, Fit
@@ -22,8 +23,6 @@ from velap.report.figures import new_figure, save_figure
 from velap.runs import write_atomic
 
 PAGE, FIGURES = "inspection.md", "inspection.json"
-NEEDED_STEPS = 3
-"""k of Eq. 9, App. B.5: a shorter episode holds no window of the dynamics loss [steps]."""
 FEW_SUCCESSES = 10
 """ours: one held-out success in ten is one episode."""
 FEW_TRANSITIONS = 5_000
@@ -113,15 +112,16 @@ def find_problems(store: FrameStore, found: Survey) -> list[Problem]:
 
 
 def _length_problems(store: FrameStore) -> list[Problem]:
-    short = int((store.episode_length < NEEDED_STEPS).sum())
+    short = int((store.episode_length < DYNAMICS_HORIZON).sum())
     if short == store.n_episodes:
         return [Problem(
             name="short-episodes", stops=True, got=f"the longest episode has {store.episode_length.max()} transitions",
-            expected=f"one of {NEEDED_STEPS} or more", do="Record longer episodes, or join consecutive ones.")]
+            expected=f"one of {DYNAMICS_HORIZON} or more", do="Record longer episodes, or join consecutive ones.")]
     problems = []
     if short > MOST * store.n_episodes:
         problems.append(Problem(
-            name="short-episodes", got=f"{short} of {store.n_episodes} episodes have fewer than {NEEDED_STEPS} transitions",
+            name="short-episodes",
+            got=f"{short} of {store.n_episodes} episodes have fewer than {DYNAMICS_HORIZON} transitions",
             expected="most to be longer",
             do="Record longer episodes. Look whether they end too early: a flag at the wrong step cuts them."))
     if store.n_transitions < FEW_TRANSITIONS:
