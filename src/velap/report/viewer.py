@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,8 +17,7 @@ from velap.data import minari_io
 from velap.errors import CheckpointError, ConfigError, UnknownTaskError
 from velap.evaluation.evaluate import Evaluation, Player, load_player
 from velap.evaluation.records import Record, read_records
-from velap.evaluation.rollout import Episode
-from velap.methods.base import Agent
+from velap.evaluation.rollout import Episode, Moment
 from velap.methods.velap import VelapAgent
 from velap.report.demo import released_checkpoint
 from velap.report.diagnose.model import open_recorded, real_states_of
@@ -101,14 +99,15 @@ class Tracer:
         self.traces: list[Trace] = []
         """Finished episodes."""
 
-    def __call__(self, row: int, seed: int, env: gym.Env[Any, Any], agent: Agent, outcome: Episode | None) -> None:
+    def __call__(self, moment: Moment) -> None:
         """Keep a step, or close the episode."""
-        seen = picture(env, SIDE)
-        if outcome is not None:
-            self.traces.append(Trace(outcome=outcome, steps=tuple(self._steps), last_picture=seen, plans=tuple(self._plans)))
+        seen = picture(moment.env, SIDE)
+        if moment.outcome is not None:
+            self.traces.append(Trace(outcome=moment.outcome, steps=tuple(self._steps), last_picture=seen,
+                                     plans=tuple(self._plans)))
             self._steps, self._plans = [], []
-        elif isinstance(agent, VelapAgent):
-            self._steps.append(self._step_of(agent, row, seen))
+        elif isinstance(moment.agent, VelapAgent):
+            self._steps.append(self._step_of(moment.agent, moment.row, seen))
         else:
             self._steps.append(Step(picture=seen, latent=None, value=None, actor=None, waypoint=None, plan=None))
 
