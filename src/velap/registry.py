@@ -92,7 +92,8 @@ class Registry(MutableMapping[str, T], Generic[T]):
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        return name in list(self)
+        self._import_home()
+        return name in self._entries or name in self._plugins()
 
     def _import_home(self) -> bool:
         """Import every module of the home, whose decorators fill the registry; says whether it is a folder."""

@@ -174,12 +174,14 @@ def describe(config: Config) -> Iterator[tuple[str, str, str, str]]:
     included."""
     for part in PARTS:
         current = getattr(config, part)
+        meanings = docs(type(current))
         for name, hint in hints(type(current)).items():
             if name != "phases":
-                yield f"{part}.{name}", type_name(hint), json.dumps(getattr(current, name)), docs(type(current))[name]
+                yield f"{part}.{name}", type_name(hint), json.dumps(getattr(current, name)), meanings[name]
         if part == "train":
             made = {phase.label: phase for phase in current.phases}
             for label, kind in LABELS.items():
+                meanings = docs(kind)
                 for name, hint in hints(kind).items():
                     value = json.dumps(getattr(made[label], name)) if label in made else "-"
-                    yield f"train.{label}.{name}", type_name(hint), value, docs(kind)[name]
+                    yield f"train.{label}.{name}", type_name(hint), value, meanings[name]
