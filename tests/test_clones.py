@@ -106,7 +106,7 @@ def test_the_clone_phase_moves_the_policy_of_successes_alone_towards_their_actio
     assert run.sampler.episodes[run.sampler.rank_of_row[learner.rows]].unique().tolist() == [0, 1]
     assert len(learner.rows) == 12 and last < 0.7 * first, "noise, learnt by heart"
     loaded, _, _ = load_checkpoint(run.finish("x").checkpoint)
-    assert loaded.search_fns()["act_success"](torch.zeros(2, SMALL.latent_dim)).shape == (2, 3)
+    assert loaded.search_fns().act_success(torch.zeros(2, SMALL.latent_dim)).shape == (2, 3)
 
 
 def test_the_end_of_successes_is_cloned(tmp_path) -> None:

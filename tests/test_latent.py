@@ -1,6 +1,8 @@
 """The Eq. 1 bundle: shapes for any prefix, action scaling, the bank, and the functions that the search is given."""
 
 import dataclasses
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import torch
 
 from tiny_training import SMALL as TINY
 from velap.config import Config
-from velap.errors import VelapError
+from velap.errors import CheckpointError, ConfigError, VelapError
 from velap.models.checkpoint import load_checkpoint, save_checkpoint, shared_weights
 from velap.models.velap import LatentModel, Spaces
 
@@ -40,18 +42,18 @@ def test_search_functions_equal_the_model(prefix, changes, hidden):
     z, goal = torch.randn(*prefix, 5), torch.randn(*prefix, 5)
     action, noise = torch.rand(*prefix, 2) * 2 - 1, torch.randn(*prefix, 16)
     pairs = [
-        (fns["propose"](z, noise), model.propose(z, noise)),
-        (fns["act_global"](z), model.act_global(z)),
-        (fns["step"](z, action), model.step(z, action)),
-        (fns["q"](z, action), model.global_q(z, action)),
-        (fns["value"](z), model.value(z)),
-        *zip(fns["reach"](z, goal), model.reach(z, goal), strict=True),
-        *zip(fns["project"](z), model.project(z), strict=True),
+        (fns.propose(z, noise), model.propose(z, noise)),
+        (fns.act_global(z), model.act_global(z)),
+        (fns.step(z, action), model.step(z, action)),
+        (fns.q(z, action), model.global_q(z, action)),
+        (fns.value(z), model.value(z)),
+        *zip(fns.reach(z, goal), model.reach(z, goal), strict=True),
+        *zip(fns.project(z), model.project(z), strict=True),
     ]
     for got, expected in pairs:
         torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
-    assert fns["d_neigh"] == 1.5
-    assert fns["step_distance"] == 0.5
+    assert fns.d_neigh == 1.5
+    assert fns.step_distance == 0.5
 
 
 def test_train_mode_is_refused():
@@ -139,3 +141,44 @@ def test_heads_belong_to_the_weights_that_they_act_by(tmp_path):
         hashes[name] = shared_weights(load_checkpoint(tmp_path / name)[2])
     assert hashes["same"] == hashes["local"] == hashes["bank"]
     assert len({hashes["same"], hashes["encoder"], hashes["global"]}) == 3
+
+
+def test_a_pretrained_model_is_read_from_file_and_folder_and_written_again(tmp_path):
+    model, config = make_model(), Config("SpiralMaze", "default", model=SMALL)
+    save_checkpoint(tmp_path / "a" / "model.safetensors", model, config, {"seed": "7", "command": "velap train"})
+    frames = torch.randint(0, 255, (2, 2, 16, 16, 3), dtype=torch.uint8)
+    for place in (tmp_path / "a", str(tmp_path / "a" / "model.safetensors")):
+        read = LatentModel.from_pretrained(place)
+        assert not read.training and read.origin.config == config and read.origin.metadata["seed"] == "7"
+        torch.testing.assert_close(read.encode(frames), model.encode(frames))
+    written = read.save_pretrained(tmp_path / "b")
+    again = LatentModel.from_pretrained(tmp_path / "b")
+    assert written == tmp_path / "b" / "model.safetensors"
+    assert (tmp_path / "b" / "config.json").read_text() == config.to_json()
+    assert again.origin.metadata["weights_sha256"] == read.origin.metadata["weights_sha256"]
+    assert again.origin.metadata["command"] == "velap train"
+    with pytest.raises(ConfigError, match="got no config"):
+        model.save_pretrained(tmp_path / "c")
+    model.save_pretrained(tmp_path / "c", config)
+    assert LatentModel.from_pretrained(tmp_path / "c").origin.config == config
+
+
+def test_a_place_that_holds_no_model_is_named(tmp_path, monkeypatch):
+    with pytest.raises(CheckpointError, match=r"no checkpoint at .*gone\.safetensors"):
+        LatentModel.from_pretrained(tmp_path / "gone.safetensors")
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(CheckpointError, match=r"somebody/model.*pip install huggingface-hub"):
+        LatentModel.from_pretrained("somebody/model")
+
+
+def test_a_model_of_the_hub_is_fetched(tmp_path, monkeypatch):
+    """By huggingface_hub's own function, here of a hub that holds one file."""
+    save_checkpoint(tmp_path / "model.safetensors", make_model(), Config("SpiralMaze", "default", model=SMALL), {})
+    hub, errors = types.ModuleType("huggingface_hub"), types.ModuleType("huggingface_hub.errors")
+    errors.HfHubHTTPError = errors.LocalEntryNotFoundError = OSError
+    asked = []
+    hub.hf_hub_download = lambda repository, name: asked.append((repository, name)) or str(tmp_path / name)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    monkeypatch.setitem(sys.modules, "huggingface_hub.errors", errors)
+    assert LatentModel.from_pretrained("somebody/model").config == SMALL
+    assert asked == [("somebody/model", "model.safetensors")]

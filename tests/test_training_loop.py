@@ -105,6 +105,17 @@ def test_foreign_and_existing_runs_are_refused(tmp_path):
         train(config(), make_store(), tmp_path, device="cpu", resume=True, seed=1)
 
 
+def test_a_second_training_in_the_same_folder_is_refused_at_once(tmp_path):
+    def begin_another(progress):
+        if progress.step == 2:
+            with pytest.raises(CheckpointError, match=r"another training is writing .*--out"):
+                train(config(), make_store(), tmp_path, device="cpu", seed=1)
+
+    train(config(), make_store(), tmp_path, device="cpu", on_progress=begin_another)
+    rows = [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert rows == [2, 4, 6, 8, 10, 12] and not (tmp_path / ".lock").exists()
+
+
 def test_cadences_may_change_with_a_resume(tmp_path):
     run = trainer(tmp_path)
     run.update()

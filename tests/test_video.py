@@ -19,7 +19,6 @@ from velap.report import demo
 from velap.report.figures import LatentMap, can_probe, plan_figure, probe, to_pixels
 from velap.report.video import CAPTION, HOLD, TILE, VideoRecorder, film
 from velap.search.est import plan
-from velap.search.types import SearchFns
 
 
 def test_positions_and_pixels_agree() -> None:
@@ -62,7 +61,7 @@ def test_a_failing_film_leaves_nothing(tmp_path: Path) -> None:
 def test_the_picture_of_a_plan(tmp_path: Path) -> None:
     player = toy_player(n_iter=60)
     latent_map = probe_few(player)
-    fns = SearchFns(**ToyModel().search_fns())  # type: ignore[arg-type]
+    fns = ToyModel().search_fns()  # type: ignore[arg-type]
     roots = torch.tensor([GOAL, (-3.0, 0.0)], dtype=torch.float64)
     result = plan(fns, roots, player.config.planner, torch.Generator().manual_seed(0))
     plan_figure(tmp_path / "plan.png", frame=np.full((8, 8, 3), 200, np.uint8), plan=result, row=1, latent_map=latent_map,

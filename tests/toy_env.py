@@ -17,6 +17,7 @@ from velap.config import Config, ModelConfig, override
 from velap.evaluation.evaluate import Player
 from velap.evaluation.records import RunKey
 from velap.methods.base import make_agent
+from velap.models.functions import SearchFns
 from velap.models.velap import Spaces
 
 SIDE = 8
@@ -108,8 +109,8 @@ class ToyModel(nn.Module):
     def to_env(self, action: Tensor) -> np.ndarray:
         return (ACTION_SCALE * action).numpy().astype(np.float32)
 
-    def search_fns(self, hidden: str | None = None) -> dict[str, object]:
-        return self._fns._asdict()
+    def search_fns(self, hidden: str | None = None) -> SearchFns:
+        return self._fns
 
 
 def toy_config(**planner: object) -> Config:

@@ -37,7 +37,6 @@ from velap.models.velap import LatentModel, Spaces
 from velap.report.demo import released_checkpoint
 from velap.runs import make_generator
 from velap.search.est import plan
-from velap.search.types import SearchFns
 from velap.tasks import get_task, make_config
 from velap.threads import usable_cores
 from velap.training.joint import JointLearner
@@ -210,7 +209,7 @@ def _plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int = P
     """Latency per environment of a VELAP plan for `batch` environments at once against MPPI with the same model."""
     model, planner, kind = _planning_model(device)
     planner = replace(planner, n_sim=n_sim)
-    fns = SearchFns(**model.search_fns())
+    fns = model.search_fns()
     shots, together, seeds = MPPIConfig(), min(batch, MPPI_BATCH), count()
     roots, plans = _roots(model, batch), PLANS_A_TURN if batch == 1 else 1
 

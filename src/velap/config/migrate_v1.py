@@ -77,8 +77,7 @@ def from_v1(raw: Any) -> Config:
     defaults = _table()["defaults"]
     if not isinstance(raw, dict) or set(raw) != {"task", "preset", *defaults}:
         raise ConfigError(f"the config has no schema and is {sorted(raw) if isinstance(raw, dict) else raw!r}; expected "
-                          "the parts "
-                          "of a config that velap saved. Restore the file.")
+                          "the parts of a config that velap saved. Restore the file.")
     whole: V1 = {}
     for part, known in defaults.items():
         unknown = sorted(set(raw[part]) - set(known))
@@ -96,8 +95,7 @@ def from_v1(raw: Any) -> Config:
 def _refuse_unless(holds: bool, name: str, got: Any, expected: Any) -> None:
     if not holds:
         raise ConfigError(f"the file was made by velap 0.1 with `{name}` = {got!r}; today's velap has {expected!r} there "
-                          "and no "
-                          "such option. Use the file with velap 0.1, or train again.")
+                          "and no such option. Use the file with velap 0.1, or train again.")
 
 
 def _carried(part: str, whole: V1) -> dict[str, Any]:

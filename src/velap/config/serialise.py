@@ -114,8 +114,7 @@ def _build_phase(raw: Any, where: str) -> Phase:
     kind = raw.get("phase") if isinstance(raw, dict) else None
     if kind not in PHASES:
         raise ConfigError(f"`{where}` is a phase of kind {kind!r}; expected one of {', '.join(PHASES)}. The file may come "
-                          "from "
-                          "another version of velap.")
+                          "from another version of velap.")
     phase: Phase = _build(PHASES[kind], {name: value for name, value in raw.items() if name != "phase"}, where)
     return phase
 

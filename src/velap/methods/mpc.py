@@ -41,7 +41,7 @@ class MPCAgent(PlanningAgent):
         super().__init__(method, model, planner.replan_every)
         self._planner: ShootingConfig = planner
         self._shoot: Shoot[Any] = shoot
-        self._fns = SearchFns(**model.search_fns(hidden=planner.arithmetic))
+        self._fns = model.search_fns(hidden=planner.arithmetic)
         self._actions = torch.empty(0)
         self._mean = torch.empty(0)
 

@@ -55,7 +55,7 @@ class VelapAgent:
         self.planned_rows: NDArray[np.int64] = np.empty(0, np.int64)
         """Rows that planned in the last `act`."""
         self._model, self._states = model, StateEncoder(model)
-        self._fns = SearchFns(**model.search_fns())
+        self._fns = model.search_fns()
         self._search, self._planner, self._n_replan = planner, config.planner, config.controller.n_replan
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._update_waypoint = waypoint_rules(config.controller, self._fns.discount)

@@ -12,10 +12,14 @@ from torch import Tensor, nn
 
 from velap._version import __version__
 from velap.config import Config
-from velap.errors import CheckpointError
+from velap.errors import CheckpointError, ConfigError
 from velap.models.velap import LatentModel, Spaces
-from velap.runs import content_sha256, load_tensors, save_tensors
+from velap.runs import content_sha256, load_tensors, save_tensors, write_atomic
 
+MODEL = "model.safetensors"
+"""Name of a checkpoint in its folder."""
+PROVENANCE = ("command", "seed", "dataset_id", "dataset_hash", "reading", "train_seconds", "diagnostics", "steps")
+"""Metadata of a checkpoint that say where it comes from."""
 MODEL_FORMAT = "velap-latent-model/1"
 WEIGHTS_SHA256 = "weights_sha256"
 """Metadata key: hash of weights and config alone, the same for the same training however long it took."""
@@ -73,6 +77,39 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tup
     model = make_model(config, spaces)
     restore(model, tensors, path)
     return model.to(device).eval().requires_grad_(False), config, metadata
+
+
+def find_checkpoint(place: Path | str) -> Path:
+    """The checkpoint file that a path, a folder or an id of the Hugging Face hub names; raises CheckpointError."""
+    path = Path(place)
+    if path.exists() or str(place).count("/") != 1 or path.suffix:
+        return path / MODEL if path.is_dir() else path
+    try:
+        from huggingface_hub import hf_hub_download  # type: ignore[import-not-found]
+        from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError  # type: ignore[import-not-found]
+    except ImportError as error:
+        raise CheckpointError(f"found no file or folder {place}, and the package huggingface-hub, which would look for "
+                              f"{place} on the Hugging Face hub, is not installed; expected one of them. Check the path, "
+                              "or `pip install huggingface-hub`.") from error
+    try:
+        return Path(hf_hub_download(str(place), MODEL))
+    except (HfHubHTTPError, LocalEntryNotFoundError) as error:
+        raise CheckpointError(f"found no file or folder {place}, and no {MODEL} in a repository {place} of the Hugging "
+                              f"Face hub ({error}); expected one of them. Check the name and the connection.") from error
+
+
+def save_folder(model: LatentModel, folder: Path, config: Config | None) -> Path:
+    """`LatentModel.save_pretrained`."""
+    if config is None and model.origin is None:
+        raise ConfigError("the model was not made by from_pretrained and got no config; expected one of them. Give the "
+                          "config of its training.")
+    provenance = dict(model.origin.metadata) if model.origin is not None else {}
+    kept = {name: provenance[name] for name in PROVENANCE if name in provenance}
+    whole = config or (model.origin.config if model.origin is not None else None)
+    assert whole is not None, "checked above"
+    save_checkpoint(folder / MODEL, model, whole, kept)
+    write_atomic(folder / "config.json", whole.to_json().encode())
+    return folder / MODEL
 
 
 def restore(module: nn.Module, tensors: Mapping[str, Tensor], path: Path | str) -> None:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from velap.config import ModelConfig
-from velap.config.planning import NEIGHBOUR_DISTANCE, Precision
-from velap.errors import VelapError
+from velap.config import Config, ModelConfig
+from velap.config.planning import Precision
 from velap.models.action_model import GENERATIVE, NOISE_DIM, ConditionalVAE
 from velap.models.encoders.base import encoder_class, latent_width
-from velap.models.inference import joined, nearest_row
+from velap.models.functions import SearchFns
+from velap.models.inference import nearest_row
 from velap.models.networks import CRITIC, DYNAMICS, MLP, POLICY, EnsembleMLP, Policy
-from velap.native.folded import dense_layers, fold
-from velap.native.kernels import native_rollout
 
 UNREWARDED = -4.0
 """Initial logit of bounded critics: sparse returns start near 0; from a half they would take thousands of updates to
@@ -42,6 +41,15 @@ class Spaces:
     action_high: tuple[float, ...]
 
 
+class Origin(NamedTuple):
+    """Where a pretrained model comes from."""
+
+    config: Config
+    """Of the whole training."""
+    metadata: Mapping[str, str]
+    """Of its checkpoint: seed, dataset, command, hashes."""
+
+
 class LatentModel(nn.Module):
     """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1; on demand a policy cloned from successes and one of held actions (ours).
 
@@ -52,6 +60,8 @@ class LatentModel(nn.Module):
                  holds: bool = False) -> None:
         super().__init__()
         self.config, self.spaces, self.discount = config, spaces, discount
+        self.origin: Origin | None = None
+        """Set by `from_pretrained`."""
         action, norm = len(spaces.action_low), config.norm
         latent = latent_width(config, action)
         self.encoder = encoder_class(config)(config, (spaces.height, spaces.width))
@@ -184,86 +194,27 @@ class LatentModel(nn.Module):
         """Environment actions `[*, A]` to [-1, 1]."""
         return ((action - self.action_low) / (self.action_high - self.action_low) * 2 - 1).clamp(-1, 1)
 
-    def search_fns(self, hidden: Precision | None = None) -> dict[str, Any]:
-        """The callables that the search needs (fields of `velap.search.types.SearchFns`), equal to the methods above but
-        without the module machinery; refuses a model in train mode. Build them anew after loading weights.
+    def search_fns(self, hidden: Precision | None = None) -> SearchFns:
+        """What the search calls: equal to the methods above, without the module machinery. See `velap.models.fast`."""
+        from velap.models.fast import search_fns
 
-        `hidden` folds normalisation into the weights of h, π^g and Q^g and runs their hidden layers in that precision:
-        faster on thousands of rows (shooting), slower on a few (trees).
+        return search_fns(self, hidden)
+
+    @classmethod
+    def from_pretrained(cls, place: Path | str, device: torch.device | str = "cpu") -> LatentModel:
+        """The model of a checkpoint in eval mode: a file, a folder with `model.safetensors`, or the id of a repository on
+        the Hugging Face hub (`user/name`; needs the package huggingface-hub). `origin` keeps its config and provenance."""
+        from velap.models.checkpoint import find_checkpoint, load_checkpoint
+
+        model, config, metadata = load_checkpoint(find_checkpoint(place), device)
+        model.origin = Origin(config, metadata)
+        return model
+
+    def save_pretrained(self, folder: Path | str, config: Config | None = None) -> Path:
+        """Write `model.safetensors` and `config.json`, which `from_pretrained` reads; returns the former's path.
+
+        `config`: of the whole training; None takes that of `origin`, and raises ConfigError where there is none.
         """
-        if self.training:
-            raise VelapError("the model is in train mode; expected eval mode for planning. Call model.eval() first.")
-        step_distance = float(self.step_distance)
-        return {
-            **self._fast_functions(hidden),
-            "project": self._fast_project() if self.config.bank_size else None,
-            "rollout": self._fast_rollout(),
-            "noise_dim": NOISE_DIM,
-            "discount": self.discount,
-            "d_neigh": NEIGHBOUR_DISTANCE * step_distance,
-            "step_distance": step_distance,
-        }
+        from velap.models.checkpoint import save_folder
 
-    def _fast_functions(self, hidden: Precision | None) -> dict[str, Callable[..., Any] | None]:
-        """h, g, π^g, Q^l and Q^g as the search calls them."""
-        decoder, local_policy = joined(self.action_model.decoder), joined(self.local_policy)
-        local_critics = joined(self.local_critics)
-        dtype = None if hidden is None else getattr(torch, hidden)
-        dynamics, global_policy = joined(self.dynamics, dtype), joined(self.global_policy, dtype)
-        global_critic = joined(self.global_critic, dtype)
-        residual, bound = self.config.dynamics_residual, self.bound
-        cloned = None if self.success_policy is None else joined(self.success_policy)
-
-        def step(latent: Tensor, action: Tensor) -> Tensor:
-            change = dynamics(latent, action)
-            return change.add_(latent) if residual else change
-
-        def act_global(latent: Tensor) -> Tensor:
-            return global_policy(latent).tanh_()
-
-        def act_local(start: Tensor, goal: Tensor) -> Tensor:
-            return local_policy(start, goal).tanh_()
-
-        def reach(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-            q = bound(local_critics(start, goal, act_local(start, goal)))
-            return q.amin(0), q.std(0, correction=0)
-
-        def global_q(latent: Tensor, action: Tensor) -> Tensor:
-            return bound(global_critic(latent, action)).amin(0)
-
-        return {
-            "propose": lambda latent, noise: decoder(latent, noise).tanh_(),
-            "act_global": act_global,
-            "act_success": None if cloned is None else lambda latent: cloned(latent).tanh_(),
-            "step": step,
-            "reach": reach,
-            "q": global_q,
-            "value": lambda latent: global_q(latent, act_global(latent)),
-        }
-
-    def _fast_rollout(self) -> Callable[[Tensor, Tensor | None, int], Tensor] | None:
-        """Simulations by `kernels.c`, `SearchFns.rollout`; None where it cannot take them."""
-        moving, residual = fold(dense_layers(self.dynamics)), self.config.dynamics_residual
-        by_noise = native_rollout(fold(dense_layers(self.action_model.decoder)), moving, residual)
-        by_policy = native_rollout(fold(dense_layers(self.global_policy)), moving, residual)
-        if by_noise is None or by_policy is None:
-            return None
-
-        def rollout(latent: Tensor, noise: Tensor | None, steps: int) -> Tensor:
-            return by_noise(latent, noise, steps) if noise is not None else by_policy(
-                latent, latent.new_empty(len(latent), 1, 0), steps)
-
-        return rollout
-
-    def _fast_project(self) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-        """`project` with the bank's norms computed once."""
-        bank = self.bank_latents.float()
-        nearest = nearest_row(bank)
-
-        def project(latent: Tensor) -> tuple[Tensor, Tensor]:
-            found = bank[nearest(latent)]
-            return found, (found - latent).norm(dim=-1)
-
-        return project
-
-
+        return save_folder(self, Path(folder), config)

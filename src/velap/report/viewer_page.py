@@ -100,7 +100,7 @@ def _plan_data(subject: Subject, plan: Planned, points: list[list[int]], backdro
 def _functions(subject: Subject) -> SearchFns:
     """The model as the planner sees it."""
     assert subject.player.model is not None
-    return SearchFns(**subject.player.model.search_fns())
+    return subject.player.model.search_fns()
 
 
 @torch.inference_mode()

@@ -76,8 +76,7 @@ class WandB:
             import wandb  # type: ignore[import-not-found]
         except ImportError as error:
             raise ConfigError("the logger 'wandb' needs the package wandb, which is not installed; expected it. Install it "
-                              "with "
-                              "`pip install wandb`, or leave the logger out.") from error
+                              "with `pip install wandb`, or leave the logger out.") from error
         folder.mkdir(parents=True, exist_ok=True)
         name = "-".join(folder.parts[-3:])
         self._run: Any = wandb.init(project="velap", dir=str(folder), id=name, name=name, resume="allow")

@@ -6,8 +6,9 @@ needs) and, at the end, `model.safetensors`.
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,9 +31,11 @@ from velap.config.training import (
 from velap.data.frames import FrameStore
 from velap.data.sampling import WindowSampler
 from velap.errors import CheckpointError, ConfigError, DatasetError
+from velap.models.checkpoint import MODEL as MODEL
 from velap.models.checkpoint import make_model, save_checkpoint
 from velap.models.velap import Spaces
-from velap.runs import make_generator, write_atomic
+from velap.runs import make_generator, storage_errors, write_atomic
+from velap.storage import locked
 from velap.training.clone import CloneLearner
 from velap.training.diagnostics import diagnose, measure_latents
 from velap.training.encoder import EncoderLearner
@@ -44,7 +47,7 @@ from velap.training.phase import Frozen, PhaseLearner, Run, start_heads_afresh
 from velap.training.state import SavedState, save_state
 from velap.training.steps import Cadence, Progress, interrupt_flag, run_steps
 
-STATE, MODEL = "state.safetensors", "model.safetensors"
+STATE = "state.safetensors"
 HOLDOUT_EPISODES = 16
 """Unrewarded episodes kept out of training for the diagnostics. ours."""
 DIAGNOSE_EVERY = 1_000
@@ -105,8 +108,7 @@ class Trainer:
         longest = int(self.store.episode_length.max())
         if longest < DYNAMICS_HORIZON:
             raise DatasetError(f"the longest episode has {longest} steps; the dynamics loss needs at least "
-                               f"{DYNAMICS_HORIZON}. "
-                               "Collect longer episodes.")
+                               f"{DYNAMICS_HORIZON}. Collect longer episodes.")
         for phase in self.phases:
             (ON_FRAMES | ON_LATENTS)[type(phase)].check(phase, self.sampler)
 
@@ -206,8 +208,8 @@ class Trainer:
         begun, asked = json.loads(state.metadata["phases"]), [phase_to_dict(phase) for phase in self.phases]
         if begun != asked[: len(begun)]:
             raise CheckpointError(f"{self.state_path} has begun the phases {begun}; expected them to be the first of those "
-                                  "asked "
-                                  f"for, {asked}. Resume with the same settings, or start a new run elsewhere with --out.")
+                                  f"asked for, {asked}. Resume with the same settings, or start a new run elsewhere with "
+                                  "--out.")
         number = {name: int(state.metadata[name]) for name in ("finished", "done", "step", "updates", "frozen")}
         state.modules({"model": self.model})
         if number["frozen"]:
@@ -260,6 +262,31 @@ def train(
     Raises CheckpointError when `run_dir` holds another run, or an unfinished one and `resume` is off.
     """
     run_dir = Path(run_dir)
+    with _only_one(run_dir):
+        return _train(config, store, run_dir, seed=seed, device=device, resume=resume, command=command, loggers=loggers,
+                      on_progress=on_progress)
+
+
+@contextlib.contextmanager
+def _only_one(run_dir: Path) -> Iterator[None]:
+    """Raises CheckpointError while another training writes the same run directory."""
+    with storage_errors(run_dir), contextlib.ExitStack() as held:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        try:
+            held.enter_context(locked(run_dir / ".lock"))
+        except BlockingIOError as error:
+            raise CheckpointError(f"another training is writing {run_dir}; expected one at a time. Wait for it, or give "
+                                  "another --out.") from error
+        released = held.pop_all()
+    with released:
+        yield
+
+
+def _train(
+    config: Config, store: FrameStore, run_dir: Path, *, seed: int, device: str, resume: bool, command: str,
+    loggers: Sequence[str | Logger], on_progress: Callable[[Progress], None]
+) -> TrainResult:
+    """`train` in a run directory of its own."""
     trainer = Trainer(config, store, run_dir, seed, pick_device(device))
     resumed = None
     if (run_dir / STATE).exists():

@@ -37,8 +37,8 @@ class SavedState:
         found = self.metadata.get("format")
         if found != STATE_FORMAT:
             raise CheckpointError(f"{path} has format {found!r}; expected {STATE_FORMAT!r}. An unfinished training of "
-                                  "another "
-                                  "version of velap goes on with that one; otherwise start a new run elsewhere with --out.")
+                                  "another version of velap goes on with that one; otherwise start a new run elsewhere "
+                                  "with --out.")
 
     def require(self, identity: Mapping[str, str]) -> None:
         """Raises CheckpointError where what must agree differs from what was saved."""
@@ -48,8 +48,7 @@ class SavedState:
                 raise CheckpointError(
                     f"{self.path} was made with another {key}: it has {_short(saved, value)}, this command has "
                     f"{_short(value, saved)}. Resume with the same task, preset, seed and dataset, or start a new run "
-                    "elsewhere "
-                    "with --out.")
+                    "elsewhere with --out.")
 
     def modules(self, modules: Mapping[str, nn.Module]) -> None:
         """Load networks."""

@@ -18,7 +18,7 @@ from velap.models.horizon import q_from_steps
 from velap.models.velap import LatentModel
 from velap.report.diagnose.model import RealStates
 from velap.search.est import plan
-from velap.search.types import Plan, SearchFns
+from velap.search.types import Plan
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def grow(model: LatentModel, config: Config, starts: Starts, seeds: Sequence[int
     device = next(model.parameters()).device
     with torch.inference_mode():
         latents = model.encode(torch.from_numpy(starts.stacks).to(device)).float()
-    fns = SearchFns(**model.search_fns())
+    fns = model.search_fns()
     return latents, plan(fns, latents, config.planner, [torch.Generator().manual_seed(seed) for seed in seeds])
 
 
