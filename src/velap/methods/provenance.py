@@ -27,7 +27,6 @@ from velap.models.horizon import q_from_steps, steps_from_q
 from velap.models.velap import LatentModel
 from velap.registry import register_method
 from velap.search.provenance import Provenance, plan
-from velap.search.types import SearchFns
 
 PATIENCE = 2
 """An edge of g is broken when it is not walked after this many times n_sim steps. ours."""
@@ -53,7 +52,7 @@ class ProvenanceAgent:
         """The plans of the last `act` that planned."""
         self.last_plan_rows: NDArray[np.int64] = np.empty(0, np.int64)
         """Rows of `last_plan`."""
-        self._states, self._fns = StateEncoder(model), SearchFns(**model.search_fns())
+        self._states, self._fns = StateEncoder(model), model.search_fns()
         self._search, self._risk = planner_config(config), risk
         self._local_policy = local_policy_of(CONTROLLER, model)
         cloned = self._fns.act_success
