@@ -12,7 +12,7 @@ import torch
 
 from tiny_training import SMALL, config, make, make_store, straight_and_resumed, to_end, trainer
 from velap.data.frames import Reading
-from velap.errors import CheckpointError, ConfigError, DatasetError
+from velap.errors import CheckpointError, ConfigError, DatasetError, StorageError
 from velap.models.checkpoint import load_checkpoint
 from velap.runs import load_tensors
 from velap.training.loop import MODEL, STATE, Trainer, train
@@ -71,7 +71,7 @@ def test_loggers_are_the_callers(tmp_path):
         train(config(), make_store(), tmp_path / "other", device="cpu", loggers=["tensorbord"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGXCPU])
 def test_a_signal_saves_the_state_and_gives_the_handlers_back(tmp_path, number):
     before = signal.getsignal(number)
 
@@ -95,6 +95,42 @@ def test_a_second_signal_acts_at_once():
             signal.raise_signal(signal.SIGINT)
 
 
+def test_clusters_may_send_their_signal_again_while_the_state_is_saved(tmp_path):
+    def stop(progress):
+        if progress.step == 4:
+            os.kill(os.getpid(), signal.SIGUSR1)
+            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config(), make_store(), tmp_path, device="cpu", on_progress=stop)
+    assert load_tensors(tmp_path / STATE)[1]["step"] == "4"
+
+
+def test_ignored_signals_stay_ignored():
+    """`nohup velap train` outlives its terminal."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupt_flag() as flag:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not flag.is_set()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_one_training_at_a_time_in_a_folder(tmp_path):
+    refused = []
+
+    def again(progress):
+        with pytest.raises(StorageError, match=r"another process is writing a training.*--out"):
+            train(config(), make_store(), tmp_path, device="cpu", seed=1)
+        refused.append(progress.step)
+
+    train(config(), make_store(), tmp_path, device="cpu", on_progress=again)
+    rows = [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert rows == refused == [2, 4, 6, 8, 10, 12] and not list(tmp_path.glob(".*lock"))
+
+
 def test_foreign_and_existing_runs_are_refused(tmp_path):
     train(config(), make_store(), tmp_path, device="cpu")
     with pytest.raises(CheckpointError, match="--resume"):
@@ -103,17 +139,6 @@ def test_foreign_and_existing_runs_are_refused(tmp_path):
         train(config(c0=0.3), make_store(), tmp_path, device="cpu", resume=True)
     with pytest.raises(CheckpointError, match="another seed"):
         train(config(), make_store(), tmp_path, device="cpu", resume=True, seed=1)
-
-
-def test_a_second_training_in_the_same_folder_is_refused_at_once(tmp_path):
-    def begin_another(progress):
-        if progress.step == 2:
-            with pytest.raises(CheckpointError, match=r"another training is writing .*--out"):
-                train(config(), make_store(), tmp_path, device="cpu", seed=1)
-
-    train(config(), make_store(), tmp_path, device="cpu", on_progress=begin_another)
-    rows = [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert rows == [2, 4, 6, 8, 10, 12] and not (tmp_path / ".lock").exists()
 
 
 def test_cadences_may_change_with_a_resume(tmp_path):

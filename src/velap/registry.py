@@ -21,6 +21,7 @@ import pkgutil
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from threading import RLock
 from typing import Any, Generic, TypeVar
 
 from velap.errors import ConfigError, UnknownTaskError
@@ -41,6 +42,7 @@ class Registry(MutableMapping[str, T], Generic[T]):
         self._home = home
         self._entries: dict[str, T] = {}
         self._complete = False
+        self._importing = RLock()
 
     def register(self, name: str) -> Callable[[Entry], Entry]:
         """Decorator: adds what it decorates under `name` and returns it unchanged.
@@ -99,14 +101,15 @@ class Registry(MutableMapping[str, T], Generic[T]):
         """Import every module of the home, whose decorators fill the registry; says whether it is a folder."""
         home = import_module(self._home)
         folder = getattr(home, "__path__", None)
-        if folder is not None and not self._complete:
-            self._complete = True  # before the imports, which may look into the registry themselves
-            try:
-                for module in pkgutil.iter_modules(folder):
-                    import_module(f"{self._home}.{module.name}")
-            except BaseException:
-                self._complete = False
-                raise
+        with self._importing:  # another thread waits until all are there
+            if folder is not None and not self._complete:
+                self._complete = True  # before the imports, which may look into the registry themselves
+                try:
+                    for module in pkgutil.iter_modules(folder):
+                        import_module(f"{self._home}.{module.name}")
+                except BaseException:
+                    self._complete = False
+                    raise
         return folder is not None
 
     def _plugins(self) -> dict[str, EntryPoint]:

@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from velap.errors import CheckpointError, StorageError
-from velap.storage import replace_file
+from velap.storage import locked, replace_file
 
 CHECKSUM = "sha256"
 
@@ -42,6 +42,20 @@ def storage_errors(path: Path) -> Iterator[None]:
             f"cannot write {path}: {reason}. Nothing was left half-written and the last good file is intact; "
             "free some space or choose another place, then run the same command again to go on."
         ) from error
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path, name: str) -> Iterator[None]:
+    """Write the results called `name` into `folder` alone; raises StorageError where another process does so now."""
+    with contextlib.ExitStack() as held:
+        with storage_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                held.enter_context(locked(folder / f".{name}.lock"))
+            except BlockingIOError as error:
+                raise StorageError(f"another process is writing {name} in {folder}; expected to be alone. Wait for it or "
+                                   "stop it, or give another --out.") from error
+        yield
 
 
 def write_atomic(path: Path, content: bytes) -> None:

@@ -19,18 +19,22 @@ def run_dir(task: str, preset: str, seed: int) -> Path:
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Hold the lock file `path`; the system releases it however a process ends. BlockingIOError: another one holds it."""
+def locked(path: Path, wait: bool = False) -> Iterator[None]:
+    """Hold the lock file `path`; the system releases it however a process ends. BlockingIOError: another one holds it.
+
+    With `wait`, its release is waited for.
+    """
     lock = FileLock(path)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=-1 if wait else 0)
     except Timeout as error:
         raise BlockingIOError(f"{path} is held by another process") from error
     try:
         yield
     finally:
+        if os.name != "nt":  # Windows deletes no open file; FileLock does it there
+            path.unlink(missing_ok=True)  # while it is held: afterwards it may be another process's lock
         lock.release()
-        path.unlink(missing_ok=True)
 
 
 def replace_file(path: Path, content: bytes) -> None:

@@ -24,6 +24,7 @@ from velap.cli.studies import bench, figure, study, table
 from velap.cli.train import collect, run, train
 from velap.cli.view import view
 from velap.errors import ConfigError, VelapError
+from velap.signals import stop_signals
 
 __all__ = ["COMMANDS", "OUT", "Settings", "main"]
 
@@ -42,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # `--env my_module:Env-v0` finds a module beside the user, as `python -m` does
     try:
-        with warnings.catch_warnings(), _terminate_as_interrupt():
+        with warnings.catch_warnings(), _stop_as_interrupt():
             warnings.filterwarnings("default", category=UserWarning, module=r"velap\..*")
             warnings.showwarning = lambda message, *_, **__: note(str(message))
             return _run(given)
@@ -59,16 +60,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _terminate_as_interrupt() -> Iterator[None]:
-    """SIGTERM, which clusters send before they take a machine away, ends the block as Ctrl-C does."""
+def _stop_as_interrupt() -> Iterator[None]:
+    """The signals of `velap.signals` end the block as Ctrl-C does."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    previous = {number: signal.signal(number, signal.default_int_handler) for number in stop_signals()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _run(given: Sequence[str]) -> int:

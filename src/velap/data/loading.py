@@ -16,7 +16,7 @@ from velap.data import checks, minari_io
 from velap.data.building import build_store, rule_of
 from velap.data.frames import Episode, FrameStore, Reading
 from velap.data.images import IMAGE_SIZE, Fit, ImageLayout, find_image
-from velap.data.mapped import build_mapped, open_mapped, too_large
+from velap.data.mapped import open_or_build, too_large
 from velap.data.success import Predicate, Success
 from velap.errors import DatasetError
 from velap.registry import READERS
@@ -114,7 +114,7 @@ def load_store(source: str | Path, image_key: str | None = None, min_length: int
         labels = files_state([Path(rule.name)]) if rule is not None and rule.source == "labels" else ""
         made_from = f"{reader.state()}; {reading.to_json()}; success {rule} {labels}{'' if need_success else ' or none'}"
         try:
-            store = open_mapped(reader.place, made_from) or build_mapped(build, reader.place, made_from)
+            store = open_or_build(build, reader.place, made_from)
         except DatasetError:
             raise
         except OSError as error:

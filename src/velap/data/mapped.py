@@ -10,7 +10,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 
 from velap.data.frames import FrameStore, Reading
 from velap.errors import DatasetError
-from velap.storage import replace_file, sync
+from velap.storage import locked, replace_file, sync
 
 FRAMES, ROWS, INDEX = "frames.bin", "rows.npz", "store.json"
 FORMAT = "velap-mapped-store/1"
@@ -47,6 +48,26 @@ def build_mapped(build: Callable[[Path | None], FrameStore], place: Path, source
 
     `source` says what it was made from; `open_mapped` compares it. Raises OSError where the disk is full.
     """
+    with _alone(place):
+        return _build(build, place, source)
+
+
+def open_or_build(build: Callable[[Path | None], FrameStore], place: Path, source: str) -> FrameStore:
+    """The store in the folder `place`, made first unless it is there; one that another process makes is waited for."""
+    with _alone(place):
+        return open_mapped(place, source) or _build(build, place, source)
+
+
+@contextmanager
+def _alone(place: Path) -> Iterator[None]:
+    """Wait until no other process works on the store in `place`, and keep others waiting."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with locked(place.with_name(f".{place.name}.lock"), wait=True):
+        yield
+
+
+def _build(build: Callable[[Path | None], FrameStore], place: Path, source: str) -> FrameStore:
+    """Make the store and map it; no other process does so now."""
     partial = place.with_name(f".{place.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -69,9 +90,9 @@ def build_mapped(build: Callable[[Path | None], FrameStore], place: Path, source
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    opened = open_mapped(place, source, verify=False)
-    assert opened is not None
-    return opened
+    made = open_mapped(place, source, verify=False)
+    assert made is not None
+    return made
 
 
 def open_mapped(place: Path, source: str, verify: bool = True) -> FrameStore | None:

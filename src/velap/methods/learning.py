@@ -21,7 +21,7 @@ from velap.errors import CheckpointError, DatasetError, TrainingError, UnknownTa
 from velap.methods.base import get_method
 from velap.methods.heads import Head, head_path, make_head, save_head
 from velap.models.checkpoint import load_checkpoint, shared_weights
-from velap.runs import load_tensors, make_generator
+from velap.runs import load_tensors, make_generator, only_writer
 from velap.threads import one_thread
 from velap.training.frozen import FrozenLearner, LearnerConfig, latent_data
 from velap.training.loggers import DEFAULT, Logger, make_loggers
@@ -124,7 +124,8 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
                on_progress: Callable[[Progress], None] = lambda progress: None) -> HeadResult:
     """Learn the head of a method on the latents of a joint checkpoint; a finished one is left as it is.
 
-    Ctrl-C saves the state and raises KeyboardInterrupt; the same call goes on from there, to the same bits on a CPU.
+    Ctrl-C and the signals of `velap.signals` save the state and raise KeyboardInterrupt; the same call goes on from
+    there, to the same bits on a CPU.
 
     Args:
         method: a registered method with a head.
@@ -164,8 +165,9 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
     data = latent_data(model, joint, metadata, store, checkpoint.parent)
     learner = kind.learner(head, data, config, make_generator(seed, stream=3, device=place))
     run = HeadRun(learner, path, identity)
-    _run(run, loggers, on_progress)
-    return _finish(run, head, metadata, {"command": command, "dataset_id": store.dataset_id})
+    with only_writer(path.parent, path.stem):
+        _run(run, loggers, on_progress)
+        return _finish(run, head, metadata, {"command": command, "dataset_id": store.dataset_id})
 
 
 def read_result(path: Path) -> HeadResult:

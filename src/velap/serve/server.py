@@ -11,7 +11,6 @@ import asyncio
 import hmac
 import ipaddress
 import logging
-import signal
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -28,6 +27,7 @@ from websockets.http11 import Request, Response
 from velap.errors import ConfigError, VelapError
 from velap.serve.messages import MAX_MESSAGE, MessageError, pack, unpack
 from velap.serve.session import Policy, Session
+from velap.signals import stop_signals
 from velap.threads import one_thread
 
 HOST, PORT = "127.0.0.1", 8000
@@ -74,12 +74,12 @@ class Server:
         self._stop: Callable[[], object] = lambda: None
 
     async def run(self, on_start: Callable[[int], object] = lambda port: None) -> None:
-        """Serve until `stop`, SIGINT or SIGTERM; `on_start` is called with the port once clients can connect."""
+        """Serve until `stop` or a signal of `velap.signals`; `on_start` is called with the port once clients can connect."""
         loop, stopped = asyncio.get_running_loop(), asyncio.Event()
         self._stop = lambda: loop.call_soon_threadsafe(stopped.set)
-        for name in (signal.SIGINT, signal.SIGTERM):
+        for number in stop_signals():
             with suppress(NotImplementedError, RuntimeError, ValueError):  # Windows, and threads other than the main one
-                loop.add_signal_handler(name, stopped.set)
+                loop.add_signal_handler(number, stopped.set)
         try:
             # Without compression a message has the length that it says. Browsers send an Origin: no web page gets in.
             server = await serve(self._handle, self._host, self._port, process_request=self._admit, compression=None,

@@ -24,6 +24,7 @@ from velap.losses import Info
 from velap.models.checkpoint import shared_weights
 from velap.models.velap import LatentModel
 from velap.runs import load_tensors, make_generator, save_tensors
+from velap.storage import locked
 from velap.training.capture import adam, set_rate
 from velap.training.encoding import encode_all, evaluated
 from velap.training.loop import HOLDOUT_EPISODES, holdout_episodes
@@ -135,15 +136,16 @@ def latent_data(model: LatentModel, config: Config, metadata: Mapping[str, str],
 def _cached_latents(model: LatentModel, sampler: WindowSampler, identity: dict[str, str], folder: Path) -> Tensor:
     """float32 [F, D] latents of every frame; the file in `folder` counts only for the same weights and data."""
     path, expected = folder / LATENTS, {"format": LATENTS_FORMAT, **identity}
-    try:
-        tensors, metadata = load_tensors(path)
-        if all(metadata.get(key) == value for key, value in expected.items()):
-            return tensors["latents"].to(sampler.device)
-    except CheckpointError:
-        pass  # a cache: missing or damaged, it is made anew
-    latents = encode_all(model, sampler)
-    save_tensors(path, {"latents": latents}, expected)
-    return latents
+    with locked(folder / f".{LATENTS}.lock", wait=True):  # learners of other heads may want them now as well
+        try:
+            tensors, metadata = load_tensors(path)
+            if all(metadata.get(key) == value for key, value in expected.items()):
+                return tensors["latents"].to(sampler.device)
+        except CheckpointError:
+            pass  # a cache: missing or damaged, it is made anew
+        latents = encode_all(model, sampler)
+        save_tensors(path, {"latents": latents}, expected)
+        return latents
 
 
 ConfigT = TypeVar("ConfigT", bound=LearnerConfig)

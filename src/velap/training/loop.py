@@ -6,9 +6,8 @@ needs) and, at the end, `model.safetensors`.
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,8 +33,7 @@ from velap.errors import CheckpointError, ConfigError, DatasetError
 from velap.models.checkpoint import MODEL as MODEL
 from velap.models.checkpoint import make_model, save_checkpoint
 from velap.models.velap import Spaces
-from velap.runs import make_generator, storage_errors, write_atomic
-from velap.storage import locked
+from velap.runs import make_generator, only_writer, write_atomic
 from velap.training.clone import CloneLearner
 from velap.training.diagnostics import diagnose, measure_latents
 from velap.training.encoder import EncoderLearner
@@ -254,47 +252,31 @@ def train(
     loggers: Sequence[str | Logger] = DEFAULT,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> TrainResult:
-    """Train to the end. Ctrl-C and SIGTERM save the state and raise KeyboardInterrupt; `resume` goes on from there, to the
-    same bits on CPU. Their handlers are restored on return; outside the main thread they are not touched.
+    """Train to the end. Ctrl-C and the signals of `velap.signals` save the state and raise KeyboardInterrupt; `resume` goes
+    on from there, to the same bits on CPU. Their handlers are restored on return; outside the main thread they are not
+    touched.
 
     `loggers` are names (`jsonl`, `tensorboard`, `wandb`) or objects with `log` and `close`.
 
-    Raises CheckpointError when `run_dir` holds another run, or an unfinished one and `resume` is off.
+    Raises CheckpointError when `run_dir` holds another run, or an unfinished one and `resume` is off; StorageError when
+    another process trains there.
     """
     run_dir = Path(run_dir)
-    with _only_one(run_dir):
-        return _train(config, store, run_dir, seed=seed, device=device, resume=resume, command=command, loggers=loggers,
-                      on_progress=on_progress)
+    with only_writer(run_dir, "a training"):
+        return _train(Trainer(config, store, run_dir, seed, pick_device(device)), resume, command, loggers, on_progress)
 
 
-@contextlib.contextmanager
-def _only_one(run_dir: Path) -> Iterator[None]:
-    """Raises CheckpointError while another training writes the same run directory."""
-    with storage_errors(run_dir), contextlib.ExitStack() as held:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        try:
-            held.enter_context(locked(run_dir / ".lock"))
-        except BlockingIOError as error:
-            raise CheckpointError(f"another training is writing {run_dir}; expected one at a time. Wait for it, or give "
-                                  "another --out.") from error
-        released = held.pop_all()
-    with released:
-        yield
-
-
-def _train(
-    config: Config, store: FrameStore, run_dir: Path, *, seed: int, device: str, resume: bool, command: str,
-    loggers: Sequence[str | Logger], on_progress: Callable[[Progress], None]
-) -> TrainResult:
-    """`train` in a run directory of its own."""
-    trainer = Trainer(config, store, run_dir, seed, pick_device(device))
+def _train(trainer: Trainer, resume: bool, command: str, loggers: Sequence[str | Logger],
+           on_progress: Callable[[Progress], None]) -> TrainResult:
+    """From the start or the saved state to the end."""
+    run_dir = trainer.run_dir
     resumed = None
     if (run_dir / STATE).exists():
         if not resume:
             raise CheckpointError(f"{run_dir} already holds a run. Add --resume to go on with it, or give another --out.")
         trainer.resume()
         resumed = trainer.step
-    write_atomic(run_dir / "config.json", config.to_json().encode())
+    write_atomic(run_dir / "config.json", trainer.config.to_json().encode())
     with interrupt_flag() as interrupted:
         run_steps(trainer, make_loggers(loggers, run_dir, "", resumed), on_progress, interrupted)
     trainer.save()

@@ -17,6 +17,7 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 from velap.errors import TrainingError
+from velap.signals import stop_signals
 from velap.training.loggers import Logger
 
 
@@ -117,13 +118,13 @@ def run_steps(run: Run, loggers: Sequence[Logger], on_progress: Callable[[Progre
 
 @contextlib.contextmanager
 def interrupt_flag() -> Iterator[threading.Event]:
-    """Within, Ctrl-C (SIGINT) and SIGTERM set the flag instead of breaking an update in two; a second one acts at once.
-    Outside the main thread signals stay as they are."""
+    """Within, the signals of `velap.signals` set the flag instead of breaking an update in two. A second Ctrl-C acts at
+    once; others may come repeatedly, clusters send several. Outside the main thread signals stay as they are."""
     flag = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield flag
         return
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.getsignal(number) for number in stop_signals()}
 
     def restore() -> None:
         for number, handler in previous.items():
@@ -131,7 +132,8 @@ def interrupt_flag() -> Iterator[threading.Event]:
 
     def note(number: int, frame: FrameType | None) -> None:
         flag.set()
-        restore()
+        if number == signal.SIGINT:
+            signal.signal(number, previous[signal.SIGINT])
 
     for number in previous:
         signal.signal(number, note)

@@ -16,9 +16,8 @@ from velap.config import Config, override
 from velap.data import minari_io
 from velap.errors import ConfigError, DatasetError
 from velap.evaluation.evaluate import Evaluation, Player, load_player
-from velap.models.checkpoint import load_checkpoint
+from velap.models.checkpoint import load_checkpoint, released_checkpoint
 from velap.models.velap import LatentModel
-from velap.report.demo import released_checkpoint
 from velap.report.diagnose import figures
 from velap.report.diagnose.failures import Failures, watch
 from velap.report.diagnose.model import (
@@ -40,7 +39,7 @@ from velap.report.diagnose.plans import Starts, Trees, diagnose_trees
 from velap.report.diagnose.text import checks, page
 from velap.report.diagnose.world import Scene, expert_curves, first_states, has_layout, look_at_scene, scenery
 from velap.report.figures import can_probe
-from velap.runs import write_atomic
+from velap.runs import only_writer, write_atomic
 from velap.tasks import TASKS, get_task, task_of
 from velap.training.diagnostics import horizons
 from velap.training.loop import pick_device
@@ -172,10 +171,11 @@ def run_diagnose(console: Console, request: Request) -> Diagnosis:
     with console.status(f"reading {subject.dataset_id}"):
         recorded = open_recorded(subject.dataset_id, request.image_key, model, config, metadata)
     out = request.out or Path("runs/diagnosis") / subject.name.replace("/", "_")
-    diagnosis = _measure(console, request, subject, model, config, recorded, player)
-    with console.status("drawing"):
-        _draw(diagnosis, out)
-    write_atomic(out / PAGE, page(diagnosis).encode())
+    with only_writer(out, "a diagnosis"):
+        diagnosis = _measure(console, request, subject, model, config, recorded, player)
+        with console.status("drawing"):
+            _draw(diagnosis, out)
+        write_atomic(out / PAGE, page(diagnosis).encode())
     for each in checks(diagnosis):
         console.print(f"{each.mark:>4}  {each.title}: {each.numbers}", markup=False, soft_wrap=True)
     console.print(f"report {out / PAGE}, {time.monotonic() - began:.0f} s", markup=False, soft_wrap=True)

@@ -1,0 +1,111 @@
+"""Two processes in one place: one holds the lock, the other is refused or waits; what both need is made once."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from latent_data import joint_checkpoint, noise_store
+from tiny_training import make_store
+from velap.data.mapped import open_or_build
+from velap.errors import StorageError
+from velap.methods.learning import train_head
+from velap.storage import locked
+from velap.training import frozen
+
+
+def take_turns(path: Path, turns: int, clashes: multiprocessing.Queue[int]) -> None:
+    """Hold the lock `turns` times, and count who else holds it meanwhile."""
+    clashed, done = 0, 0
+    while done < turns:
+        try:
+            with locked(path):
+                try:
+                    os.close(os.open(path.with_name("inside"), os.O_CREAT | os.O_EXCL))
+                    path.with_name("inside").unlink()
+                except OSError:
+                    clashed += 1
+            done += 1
+        except BlockingIOError:
+            pass
+    clashes.put(clashed)
+
+
+def test_a_lock_has_one_holder_however_often_it_changes_hands(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    clashes: multiprocessing.Queue[int] = context.Queue()
+    workers = [context.Process(target=take_turns, args=(tmp_path / "lock", 400, clashes)) for _ in range(4)]
+    for worker in workers:
+        worker.start()
+    assert sum(clashes.get(timeout=90) for _ in workers) == 0
+    for worker in workers:
+        worker.join()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_lock_is_refused_and_waited_for(tmp_path: Path) -> None:
+    entered = threading.Event()
+
+    def wait() -> None:
+        with locked(tmp_path / "lock", wait=True):
+            entered.set()
+
+    with locked(tmp_path / "lock"):
+        with pytest.raises(BlockingIOError), locked(tmp_path / "lock"):
+            pass
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        assert not entered.wait(0.3)
+    waiting.join(timeout=20)
+    assert entered.is_set()
+
+
+def test_mapped_frames_are_made_once_for_all_that_want_them(tmp_path: Path) -> None:
+    built: list[int] = []
+
+    def build(path: Path | None) -> frozen.FrameStore:
+        built.append(1)
+        store = make_store()
+        assert path is not None
+        path.write_bytes(store.frames.tobytes())
+        return store
+
+    hashes: list[str] = []
+    place = tmp_path / "data" / "mapped"
+    threads = [threading.Thread(target=lambda: hashes.append(open_or_build(build, place, "noise").content_hash))
+               for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=60)
+    assert (len(built), hashes) == (1, [make_store().content_hash] * 4)
+
+
+def test_latents_are_encoded_once_for_heads_that_are_learnt_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = noise_store(successes=10)
+    checkpoint, encoded, encode = joint_checkpoint(tmp_path / "model.safetensors", store), [], frozen.encode_all
+    monkeypatch.setattr(frozen, "encode_all", lambda *given: encoded.append(1) or encode(*given))
+    threads = [threading.Thread(target=train_head, args=(method, checkpoint, store), kwargs={"steps": 4, "loggers": []})
+               for method in ("bc", "iql", "bc-success")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=60)
+    assert len(encoded) == 1 and all((tmp_path / f"{method}.safetensors").exists() for method in ("bc", "iql", "bc-success"))
+
+
+def test_one_training_of_a_head_at_a_time(tmp_path: Path) -> None:
+    store, refused = noise_store(successes=10), []
+    checkpoint = joint_checkpoint(tmp_path / "model.safetensors", store)
+
+    def again(progress: object) -> None:
+        with pytest.raises(StorageError, match="another process is writing bc"):
+            train_head("bc", checkpoint, store, steps=4, loggers=[])
+        refused.append(progress)
+
+    train_head("bc", checkpoint, store, steps=4, on_progress=again)
+    assert refused
