@@ -15,6 +15,7 @@ from toy_world import GOAL, misleading_value
 from velap.errors import CheckpointError, StorageError
 from velap.evaluation.evaluate import Player
 from velap.evaluation.rollout import FrameReader
+from velap.models import checkpoint
 from velap.report import demo
 from velap.report.figures import LatentMap, can_probe, plan_figure, probe, to_pixels
 from velap.report.video import CAPTION, HOLD, TILE, VideoRecorder, film
@@ -88,7 +89,6 @@ def probe_few(player: Player) -> LatentMap:
 
 
 def test_a_missing_release_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(demo, "__file__", str(tmp_path / "a" / "b" / "c" / "demo.py"))
+    monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "models" / "checkpoint.py"))
     with pytest.raises(CheckpointError, match="velap run SpiralMaze"):
-        demo.released_checkpoint("SpiralMaze")
+        checkpoint.released_checkpoint("SpiralMaze")

@@ -32,9 +32,8 @@ from velap.data.loading import load_store
 from velap.data.writing import write_dataset
 from velap.errors import CheckpointError, VelapError
 from velap.methods.mppi import MPPIConfig, shoot
-from velap.models.checkpoint import load_checkpoint
+from velap.models.checkpoint import load_checkpoint, released_checkpoint
 from velap.models.velap import LatentModel, Spaces
-from velap.report.demo import released_checkpoint
 from velap.runs import make_generator
 from velap.search.est import plan
 from velap.tasks import get_task, make_config

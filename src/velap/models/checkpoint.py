@@ -15,6 +15,7 @@ from velap.config import Config
 from velap.errors import CheckpointError, ConfigError
 from velap.models.velap import LatentModel, Spaces
 from velap.runs import content_sha256, load_tensors, save_tensors, write_atomic
+from velap.tasks import get_task
 
 MODEL = "model.safetensors"
 """Name of a checkpoint in its folder."""
@@ -126,3 +127,12 @@ def restore(module: nn.Module, tensors: Mapping[str, Tensor], path: Path | str) 
             "The file comes from another version of velap; train again."
         )
     module.load_state_dict(tensors)
+
+
+def released_checkpoint(task: str) -> Path:
+    """The checkpoint of a task that is shipped with the package; in a checkout the package links to `checkpoints/`."""
+    path = Path(__file__).resolve().parents[1] / "checkpoints" / f"{get_task(task).name}.safetensors"
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint of {task} is shipped with this velap: expected {path}. Train one with "
+                              f"`velap run {task}`, or name one with --checkpoint.")
+    return path.resolve()

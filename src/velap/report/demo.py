@@ -8,17 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from velap.errors import CheckpointError
 from velap.evaluation.console import EpisodeBar
 from velap.evaluation.evaluate import Evaluation, Player, load_player, to_record
 from velap.evaluation.records import Record
 from velap.evaluation.rollout import Moment
 from velap.evaluation.summary import Summary, summarise, summary_text
 from velap.methods.velap import VelapAgent
+from velap.models.checkpoint import released_checkpoint
 from velap.report.figures import LatentMap, plan_figure
 from velap.report.video import VideoRecorder, latent_map_of, picture
 from velap.search.types import Plan
-from velap.tasks import get_task
 
 PICTURE = 512
 """Side of the frame in the picture [px]."""
@@ -38,7 +37,7 @@ class FirstPlan:
         if wanted and isinstance(agent, VelapAgent) and isinstance(agent.last_plan, Plan):
             rows = np.flatnonzero(agent.last_plan_rows == moment.row)
             if len(rows):
-                self._kept = picture(moment.env, PICTURE), agent.last_plan, int(rows[0])
+                self._kept = picture(moment, PICTURE), agent.last_plan, int(rows[0])
 
     def draw(self, latent_map: LatentMap, path: Path) -> bool:
         """Draw it into `path`; False where the episode had no plan."""
@@ -48,17 +47,6 @@ class FirstPlan:
         plan_figure(path, frame=frame, plan=plan, row=row, latent_map=latent_map,
                     title=f"VELAP's first plan of episode {self._seed}")
         return True
-
-
-def released_checkpoint(task: str) -> Path:
-    """`checkpoints/<task>.safetensors` of this folder, or of the checkout that velap is installed from."""
-    name = Path("checkpoints") / f"{get_task(task).name}.safetensors"
-    places = [name, Path(__file__).resolve().parents[3] / name]
-    for path in places:
-        if path.is_file():
-            return path
-    raise CheckpointError(f"no released checkpoint of {task}: neither {places[0]} nor {places[1]} is there. Train one with "
-                          f"`velap run {task}`, or name one with --checkpoint.")
 
 
 def run_demo(console: Console, task: str, *, checkpoint: Path | None = None, episodes: int = 10, out: Path,
@@ -90,6 +78,6 @@ def _play(console: Console, player: Player, episodes: int, video: Path, latent_m
             view.step(moment.row)
 
         for episode in player.rollout(episodes, observe).run(range(episodes)):
-            records.append(to_record(player, episode, episodes))
+            records.append(to_record(player.key, episode, episodes, player.device))
             view(records[-1])
     return records
