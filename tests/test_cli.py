@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
@@ -19,10 +20,11 @@ import velap
 from velap import cli
 from velap.cli.settings import parse_settings
 from velap.config import describe, override
-from velap.errors import ConfigError
+from velap.data.frames import Reading
+from velap.errors import ConfigError, RecordError
 from velap.evaluation.records import read_records
 from velap.methods.base import get_method
-from velap.models.checkpoint import save_checkpoint
+from velap.models.checkpoint import load_checkpoint, save_checkpoint
 from velap.models.velap import LatentModel, Spaces
 from velap.tasks import TASKS, make_config
 
@@ -270,6 +272,62 @@ def test_an_environment_gets_its_arguments(mine: list[str], capsys: pytest.Captu
     assert cli.main([*mine, "--image-key", "side"]) == 2
     assert "side" in capsys.readouterr().err
     assert read_records(path) == [record]
+
+
+def test_the_camera_is_the_one_that_the_checkpoint_learnt_from(mine: list[str], tmp_path: Path,
+                                                               capsys: pytest.CaptureFixture[str]) -> None:
+    reading = {"reading": Reading("wrist").to_json(), "seed": "3"}
+    model, config, _ = load_checkpoint(untrained(tmp_path / "any.safetensors", task="mine"))
+    save_checkpoint(tmp_path / "wrist.safetensors", model, config, reading)
+    mine += ["--env-kwargs", "obs_type=pixels", "win=1.0", "--method", "td3bc"]
+    assert cli.main([*mine, "--checkpoint", str(tmp_path / "wrist.safetensors")]) == 0
+    (path,) = Path("runs/records").rglob("*.jsonl")
+    assert [record.image_key for record in read_records(path)] == ["wrist"]
+    assert cli.main([*mine, "--checkpoint", str(tmp_path / "any.safetensors"), "--fresh"]) == 2
+    assert "several images among its observations: front, wrist" in capsys.readouterr().err
+
+
+def test_a_camera_of_plain_observations_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    plain = ["evaluate", "toys", "--env", "toy_env:Toy-v0", "--method", "random", "--episodes", "1"]
+    assert cli.main([*plain, "--image-key", "wrist"]) == 2
+    assert "plain observations and no key 'wrist'" in capsys.readouterr().err
+
+
+def test_an_environment_that_draws_nothing_is_filmed_as_the_agent_sees_it(mine: list[str]) -> None:
+    mine += ["--env-kwargs", "obs_type=pixels", "win=1.0", "render_mode=null", "--image-key", "front", "--video"]
+    assert cli.main(mine) == 0
+    (video,) = Path("runs/videos").rglob("*.mp4")
+    frames = [frame.mean() for frame in imageio.get_reader(video)]
+    assert frames[0] < frames[4], "the picture brightens from step to step"
+
+
+def test_python_can_what_the_command_line_can(mine: list[str], tmp_path: Path) -> None:
+    checkpoint = untrained(tmp_path / "mine.safetensors", task="mine")
+    options: dict[str, Any] = {"env": "own_robot:Mine-v0", "env_kwargs": {"obs_type": "pixels"}, "image_key": "front",
+                               "max_steps": 3, "success": "reward>=0", "episodes": 1, "batch": 1, "records": "both"}
+    velap.evaluate("mine", str(checkpoint), changes={"controller": {"n_replan": 2}}, **options)
+    (path,) = Path("both").rglob("*.jsonl")
+    written = path.read_bytes()
+    command = ["evaluate", "mine", "--env", "own_robot:Mine-v0", "--checkpoint", str(checkpoint), "--env-kwargs",
+               "obs_type=pixels", "--image-key", "front", "--max-steps", "3", "--success", "reward>=0", "--episodes", "1",
+               "--batch", "1", "--records", "both"]
+    assert cli.main([*command, "--set", "controller.n_replan=2"]) == 0
+    assert path.read_bytes() == written, "the command finds the records of the same run"
+    assert cli.main([*command, "--set", "controller.n_replan=3"]) == 2
+    with pytest.raises(RecordError, match="config_hash"):
+        velap.evaluate("mine", checkpoint, changes={"controller": {"n_replan": 3}}, **options)
+
+
+def test_agents_are_loaded_with_other_fields(tmp_path: Path) -> None:
+    checkpoint = untrained(tmp_path / "any.safetensors")
+    frames = np.zeros((1, 1, 64, 64, 3), np.uint8)
+    few = velap.load(checkpoint, "mppi", changes={"mppi": {"samples": 2, "elites": 1, "horizon": 3}}, device="cpu").act(frames)
+    many = velap.load(checkpoint, "mppi", changes={"mppi": {"samples": 9, "elites": 1, "horizon": 3}}, device="cpu").act(frames)
+    assert (few != many).any()
+    with pytest.raises(ConfigError, match="n_iterations"):
+        velap.load(checkpoint, changes={"planner": {"n_iterations": 3}}, device="cpu")
+    with pytest.raises(ConfigError, match="'random' acts without a checkpoint"):
+        velap.load(checkpoint, "random", device="cpu")
 
 
 def test_where_every_step_costs_success_has_to_be_said(mine: list[str], capsys: pytest.CaptureFixture[str]) -> None:

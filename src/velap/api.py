@@ -177,7 +177,8 @@ def _is_finished(checkpoint: Path, config: Config, seed: int, dataset_hash: str)
     return saved == config and metadata["seed"] == str(seed) and metadata["dataset_hash"] == dataset_hash
 
 
-def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", head: Path | str | None = None) -> Agent:
+def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", head: Path | str | None = None, *,
+         changes: Changes | None = None) -> Agent:
     """An agent that acts by a checkpoint: `reset(mask, seeds)` at the start of episodes, then `act(frames)`.
 
     Args:
@@ -185,25 +186,28 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
         method: a name in `velap.registry.METHODS`, such as `velap`, or `td3bc` for π^g alone.
         device: `auto`, `cpu` or `cuda`.
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
+        changes: fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`, or of the method's own
+            settings, `{"mppi": {"temperature": 1.0}}`.
     """
+    from velap.evaluation.evaluate import Evaluation, load_method
     from velap.methods.base import get_method, make_agent
-    from velap.methods.heads import head_path, load_head
-    from velap.models.checkpoint import load_checkpoint
-    from velap.training.loop import pick_device
 
-    model, config, metadata = load_checkpoint(Path(checkpoint), pick_device(device))
-    learnt = None
-    if get_method(method).learns:
-        learnt = load_head(head or head_path(checkpoint, method), metadata, pick_device(device))
-    bounds = np.array([model.spaces.action_low, model.spaces.action_high], np.float32)
-    return make_agent(method, model, config, gym.spaces.Box(bounds[0], bounds[1], dtype=np.float32), learnt)
+    if not get_method(method).needs_model:
+        raise ConfigError(f"the method {method!r} acts without a checkpoint; expected one that acts by it. Evaluate it by "
+                          f"velap.evaluate(TASK, method={method!r}).")
+    loaded = load_method(Evaluation("", method=method, checkpoint=Path(checkpoint), device=device, changes=changes,
+                                    head=None if head is None else Path(head)))
+    assert loaded.model is not None
+    low, high = np.array([loaded.model.spaces.action_low, loaded.model.spaces.action_high], np.float32)
+    return make_agent(method, loaded.model, loaded.config, gym.spaces.Box(low, high, dtype=np.float32), loaded.head,
+                      loaded.settings)
 
 
 def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,
              first_seed: int = 0, env: str | None = None, env_kwargs: Mapping[str, Any] | None = None,
              image_key: str | None = None, max_steps: int | None = None, success: str | None = None,
              records: Path | str = OWN_RECORDS, fresh: bool = False, batch: int = 10, device: str = "auto",
-             head: Path | str | None = None) -> Summary:
+             head: Path | str | None = None, changes: Changes | None = None) -> Summary:
     """Success rate and more over seeded test episodes; goes on where an earlier call with the same records stopped.
 
     Args:
@@ -215,7 +219,7 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
         first_seed: seed of the first one; test seeds are 0 to 99.
         env: any Gymnasium id instead of the task's own environment.
         env_kwargs: arguments of `gymnasium.make` besides the id.
-        image_key: key of the image in dict observations.
+        image_key: key of the image in dict observations; None takes the checkpoint's, where the environment has it.
         max_steps: time limit where the environment has none, or a shorter one [steps].
         success: what success is, a rule of `velap.data.success` such as `reward>=0`; None takes the checkpoint's.
         records: root of the record files.
@@ -223,6 +227,7 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
         batch: environments at once.
         device: `auto`, `cpu` or `cuda`.
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
+        changes: fields of the checkpoint's config or of the method's own settings to replace, as in `load`.
     """
     from velap.evaluation.evaluate import Evaluation, play
     from velap.evaluation.evaluate import evaluate as run
@@ -234,5 +239,5 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
                               success=success, batch=batch))
     what = Evaluation(task, method=method, checkpoint=None if checkpoint is None else Path(checkpoint), env=env,
                       env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=max_steps,
-                      success=success, device=device, head=None if head is None else Path(head))
+                      success=success, device=device, head=None if head is None else Path(head), changes=changes)
     return summarise(run(what, seeds, Path(records), fresh=fresh, batch=batch))

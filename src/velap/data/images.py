@@ -100,7 +100,9 @@ def find_image(space: gym.Space, image_key: str | None, where: str,
         fit: how an oblong image becomes square; without it such an image is refused.
     """
     leaves = dict(_leaves(space))
-    if image_key and () not in leaves:
+    if image_key and () in leaves:
+        raise DatasetError(f"{where} has plain observations and no key {image_key!r}; expected none. Leave --image-key out.")
+    if image_key:
         path = next((path for path in leaves if "/".join(path) == image_key), None)
         if path is None:
             raise DatasetError(f"{where} has no observation key {image_key!r}; expected one of {_listing(leaves)}. "
@@ -117,6 +119,11 @@ def find_image(space: gym.Space, image_key: str | None, where: str,
         raise DatasetError(f"{where} has several images among its observations: {cameras}; expected one. "
                            f"Name the one to use with --image-key, for example --image-key {found[0].name}.")
     return _checked(found[0], leaves[found[0].key], where, fit)
+
+
+def known_key(space: gym.Space, image_key: str) -> str | None:
+    """The key, if observations of that space have it."""
+    return image_key if image_key and image_key in {"/".join(path) for path, _ in _leaves(space)} else None
 
 
 def _is_picture(layout: ImageLayout, box: gym.Space) -> bool:

@@ -17,14 +17,14 @@ import velap.envs  # noqa: F401 - registers the tasks
 from velap._version import __version__
 from velap.config import Config
 from velap.data.frames import Reading
-from velap.data.images import IMAGE_SIZE
+from velap.data.images import IMAGE_SIZE, known_key
 from velap.data.success import Success
 from velap.errors import ConfigError, UnknownTaskError
 from velap.evaluation.records import Record, RecordFile, RunKey, select
 from velap.evaluation.rollout import Episode, FrameReader, Observer, Rollout, make_envs
 from velap.methods.base import Agent, get_method, learning_methods, make_agent
 from velap.methods.heads import Head, head_path, load_head
-from velap.models.checkpoint import WEIGHTS_SHA256, load_checkpoint, shared_weights
+from velap.models.checkpoint import WEIGHTS_SHA256, load_checkpoint, released_checkpoint, shared_weights
 from velap.models.velap import LatentModel
 from velap.tasks import TASKS, get_task, make_config
 
@@ -53,13 +53,13 @@ class Evaluation:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Arguments of `gymnasium.make` besides the id."""
     image_key: str | None = None
-    """Key of the image in dict observations."""
+    """Key of the image in dict observations; None takes the one that the checkpoint keeps, where the environment has it."""
     max_steps: int | None = None
     """Time limit [steps], if it is shorter than the environment's own or the environment has no limit."""
     success: str | None = None
     """What counts as success, a rule of `velap.data.success`; None takes the one that the checkpoint keeps."""
     device: str = "auto"
-    changes: dict[str, dict[str, Any]] | None = None
+    changes: Mapping[str, Mapping[str, Any]] | None = None
     """Fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`, or of the method's own settings,
     `{"mppi": {"temperature": 1.0}}`."""
     head: Path | None = None
@@ -117,7 +117,7 @@ def load_player(what: Evaluation) -> Player:
     task_env = TASKS[what.task].env_id if what.task in TASKS else None
     env_id = what.env or get_task(what.task).env_id
     method = get_method(what.method)
-    loaded = _load_model(what)
+    loaded = load_method(what)
     model, config = loaded.model, loaded.config
     if what.env is None and config.task != what.task:
         raise ConfigError(f"{what.checkpoint} was trained on {config.task!r}, not on {what.task!r}; expected "
@@ -126,12 +126,13 @@ def load_player(what: Evaluation) -> Player:
     env = make_env(env_id, what.env_kwargs)
     try:
         agent = make_agent(what.method, model, config, _checked_actions(env, model), loaded.head, loaded.settings)
-        FrameReader(env, size, what.image_key, loaded.reading.fit)
+        image_key = what.image_key or known_key(env.observation_space, loaded.reading.image_key)
+        FrameReader(env, size, image_key, loaded.reading.fit)
         max_steps = _time_limit(env, what.max_steps)
     finally:
         env.close()
     key = RunKey(task=what.task if env_id == task_env else env_id, method=what.method, preset=config.preset,
-                 train_seed=loaded.seed, env=env_id, env_kwargs=what.env_kwargs, image_key=what.image_key,
+                 train_seed=loaded.seed, env=env_id, env_kwargs=what.env_kwargs, image_key=image_key,
                  max_steps=max_steps, success_rule=what.success or loaded.reading.success or None,
                  config_hash=method.config_hash(config, loaded.head, loaded.settings), checkpoint=loaded.digest,
                  code_version=code_version())
@@ -150,8 +151,8 @@ def _time_limit(env: gym.Env[Any, Any], asked: int | None) -> int:
     return min(limits)
 
 
-class _Loaded(NamedTuple):
-    """What an evaluation reads from disk, and how the method plans."""
+class LoadedMethod(NamedTuple):
+    """What a method reads from disk, and how it plans."""
 
     model: LatentModel | None
     config: Config
@@ -164,8 +165,8 @@ class _Loaded(NamedTuple):
     reading: Reading = AS_THE_TASKS
 
 
-def _load_model(what: Evaluation) -> _Loaded:
-    """Checkpoint, head and settings of the method; a bare config for `random`."""
+def load_method(what: Evaluation) -> LoadedMethod:
+    """Checkpoint, head and settings of the method, with the changes that are asked for; a bare config for `random`."""
     from velap.config import override
     from velap.training.loop import pick_device
 
@@ -174,13 +175,14 @@ def _load_model(what: Evaluation) -> _Loaded:
         raise ConfigError(f"method {what.method!r} learns no head and got {what.head}; expected one of "
                           f"{', '.join(learning_methods())}. Leave --head out, or name that method.")
     if not method.needs_model:
-        return _Loaded(None, make_config(what.task, what.preset), 0, "")
+        return LoadedMethod(None, make_config(what.task, what.preset), 0, "")
     if what.checkpoint is None:
-        raise ConfigError(f"method {what.method!r} acts by a trained model and got none; name one with --checkpoint, or "
-                          f"train one with `velap train {what.task}`.")
+        released = f", such as {released_checkpoint(what.task)}" if what.task in TASKS else ""
+        raise ConfigError(f"method {what.method!r} acts by a trained model and got none; name one with --checkpoint"
+                          f"{released}, or train one with `velap train {what.task}`.")
     device = pick_device(what.device)
     model, config, metadata = load_checkpoint(what.checkpoint, device)
-    changes = dict(what.changes or {})
+    changes = {part: dict(fields) for part, fields in (what.changes or {}).items()}
     settings = method.settings_of(config.preset, changes.pop(what.method, None))
     head = None
     if method.learns:
@@ -188,7 +190,7 @@ def _load_model(what: Evaluation) -> _Loaded:
     seed = int(metadata.get("seed", 0))
     digest = metadata[WEIGHTS_SHA256] if method.whole_checkpoint else shared_weights(metadata)
     reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else AS_THE_TASKS
-    return _Loaded(model, override(config, **changes), seed, digest, head, settings, reading)
+    return LoadedMethod(model, override(config, **changes), seed, digest, head, settings, reading)
 
 
 def make_env(env_id: str, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, Any]:
@@ -251,7 +253,7 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
         if missing:
             batch = min(batch, len(missing))
             for episode in player.rollout(batch).run(missing):
-                record = to_record(player, episode, batch)
+                record = to_record(player.key, episode, batch, player.device)
                 file.append(record)
                 on_record(record)
         return select(file.records, seeds)
@@ -288,20 +290,18 @@ def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str
         rule = None if success is None else Success.parse(success)
         rollout = Rollout(envs, agent, FrameReader(envs[0], image_size, image_key, None), max_steps=key.max_steps,
                           reset_options=reset_options(envs[0]), success=rule)
-        return [Record(**vars(key), episode_seed=each.seed, success=each.success, steps=each.steps,
-                       truncated=each.truncated, plan_ms=each.plan_ms, batch=batch, device="")
+        return [to_record(key, each, batch, device="")
                 for each in sorted(rollout.run(seeds), key=lambda each: each.seed)]
     finally:
         for made in envs:
             made.close()
 
 
-def to_record(player: Player, episode: Episode, batch: int) -> Record:
-    """The record of an episode that ran with `batch` - 1 others, times rounded to microseconds."""
-    return Record(**vars(player.key), episode_seed=episode.seed, success=episode.success, steps=episode.steps,
+def to_record(key: RunKey, episode: Episode, batch: int, device: str) -> Record:
+    """The record of an episode that ran with `batch` - 1 others on `device`, times rounded to microseconds."""
+    return Record(**vars(key), episode_seed=episode.seed, success=episode.success, steps=episode.steps,
                   truncated=episode.truncated, plan_ms=tuple(round(value, 3) for value in episode.plan_ms),
-                  plan_steps=episode.plan_steps, batch=batch,
-                  device=player.device)
+                  plan_steps=episode.plan_steps, batch=batch, device=device)
 
 
 @cache

@@ -50,6 +50,8 @@ class Moment:
     env: gym.Env[Any, Any]
     """In this state."""
     agent: Agent
+    frame: NDArray[np.uint8]
+    """What the agent sees, uint8 [H, W, 3]."""
     outcome: Episode | None = None
     """How the episode went, in its last state; None before."""
 
@@ -153,7 +155,7 @@ class Rollout:
         if np.isfinite(self._agent.last_plan_ms[index]):
             row.plan_ms.append(float(self._agent.last_plan_ms[index]))
         if self._observer is not None:
-            self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent))
+            self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent, frame=row.frames[-1]))
         observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
         row.frames.append(self._read(observation))
         success = success_of(float(reward), info, self._success, bool(terminated))
@@ -163,7 +165,8 @@ class Rollout:
         gave_up = bool(out_of_time and not success and not terminated)
         outcome = Episode(row.seed, success, row.steps, gave_up, tuple(row.plan_ms), row.plan_steps)
         if self._observer is not None:
-            self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent, outcome=outcome))
+            self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent, frame=row.frames[-1],
+                                  outcome=outcome))
         return outcome
 
 

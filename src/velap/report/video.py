@@ -6,12 +6,12 @@ S side of a tile [px], B environments.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
-import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class VideoRecorder:
         self._steps = [0] * tiles
         self._last_row = -1
         self._font = ImageFont.load_default(size=12)
-        self._partial = path.with_name(f".{path.name}")
+        self._partial = path.with_name(f".{os.getpid()}-{path.name}")  # of this process alone
 
     def __enter__(self) -> Self:
         height, width = self._canvas.shape[:2]
@@ -70,7 +70,7 @@ class VideoRecorder:
             self._write()
         self._last_row = row
         text = f"episode {moment.seed}, step {self._steps[row]}\n"
-        image = Image.fromarray(picture(moment.env, TILE))
+        image = Image.fromarray(picture(moment, TILE))
         colour: tuple[int, int, int] = (0, 0, 0)
         if outcome is not None:
             text, colour = (f"{text}solved", _SOLVED) if outcome.success else (f"{text}not solved", _FAILED)
@@ -117,11 +117,14 @@ class VideoRecorder:
                 self._partial.unlink(missing_ok=True)
 
 
-def picture(env: gym.Env[Any, Any], size: int) -> NDArray[np.uint8]:
-    """What the environment looks like now, uint8 [size, size, 3]; drawn at that size where the environment can."""
+def picture(moment: Moment, size: int) -> NDArray[np.uint8]:
+    """What the environment looks like, uint8 [size, size, 3]: drawn at that size where it can; what the agent sees where it
+    draws nothing."""
+    env = moment.env
     if can_probe(env):
         return env.unwrapped.render(size)
-    image = Image.fromarray(np.asarray(env.render(), np.uint8))
+    drawn = env.render() if env.render_mode == "rgb_array" else None
+    image = Image.fromarray(moment.frame if drawn is None else np.asarray(drawn, np.uint8))
     return np.asarray(image.resize((size, size), Image.Resampling.NEAREST))
 
 
