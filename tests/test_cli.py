@@ -321,9 +321,9 @@ def test_python_can_what_the_command_line_can(mine: list[str], tmp_path: Path) -
 def test_agents_are_loaded_with_other_fields(tmp_path: Path) -> None:
     checkpoint = untrained(tmp_path / "any.safetensors")
     frames = np.zeros((1, 1, 64, 64, 3), np.uint8)
-    few = velap.load(checkpoint, "mppi", changes={"mppi": {"samples": 2, "elites": 1, "horizon": 3}}, device="cpu").act(frames)
-    many = velap.load(checkpoint, "mppi", changes={"mppi": {"samples": 9, "elites": 1, "horizon": 3}}, device="cpu").act(frames)
-    assert (few != many).any()
+    few, many = ({"mppi": {"samples": samples, "elites": 1, "horizon": 5}} for samples in (2, 9))
+    assert (velap.load(checkpoint, "mppi", changes=few, device="cpu").act(frames)
+            != velap.load(checkpoint, "mppi", changes=many, device="cpu").act(frames)).any()
     with pytest.raises(ConfigError, match="n_iterations"):
         velap.load(checkpoint, changes={"planner": {"n_iterations": 3}}, device="cpu")
     with pytest.raises(ConfigError, match="'random' acts without a checkpoint"):

@@ -20,13 +20,14 @@ from toy_world import GOAL, START, toy_fns
 from velap import cli
 from velap.config import Config, ModelConfig, describe
 from velap.config.training import TrainConfig
-from velap.data.frames import FrameStore
+from velap.data.frames import FrameStore, Reading
 from velap.data.sampling import WindowSampler
 from velap.data.writing import Extras, write_dataset
 from velap.envs.mazes.env import STEP_LENGTH, SpiralMaze
 from velap.envs.sawyer.tasks import DrawerButton
 from velap.evaluation.rollout import FrameReader
-from velap.report import demo
+from velap.models import checkpoint as checkpoints
+from velap.models.checkpoint import load_checkpoint
 from velap.report.diagnose import failures, text
 from velap.report.diagnose.failures import CLASSES, REMEDIES, Trace, classify, judge, watch
 from velap.report.diagnose.model import (
@@ -37,6 +38,7 @@ from velap.report.diagnose.model import (
     ValueCurve,
     action_values,
     encode_states,
+    open_recorded,
     other_pairs,
     rank_correlation,
     real_states_of,
@@ -381,6 +383,14 @@ def test_a_foreign_dataset_needs_no_environment(small: str, tmp_path: Path) -> N
     assert "## Episodes" not in text
 
 
+@pytest.mark.parametrize(("kept", "named", "episodes"), [("reward>=0", None, 12), ("reward>=0", "reward>=1", 1)])
+def test_the_data_are_read_as_the_checkpoint_says(small: str, tmp_path: Path, kept: str, named: str | None,
+                                                  episodes: int) -> None:
+    model, config, _ = load_checkpoint(untrained(tmp_path / "model.safetensors", task="robot"))
+    store = open_recorded(small, None, model, config, {"reading": Reading(success=kept).to_json()}, named).store
+    assert store.rewards.sum() == episodes, "an episode ends with its first success"
+
+
 def test_a_foreign_environment_is_run(small: str, tmp_path: Path) -> None:
     checkpoint = untrained(tmp_path / "model.safetensors", task="robot")
     assert cli.main(["diagnose", "toys", "--dataset", small, "--env", "toy_env:Toy-v0", "--checkpoint", str(checkpoint),
@@ -407,7 +417,7 @@ def test_a_foreign_environment_is_run(small: str, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("small")
 def test_errors_are_one_paragraph_and_leave_nothing(arguments: list[str], text: str, monkeypatch: pytest.MonkeyPatch,
                                                     capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(demo, "__file__", str(Path("a/b/c/demo.py").absolute()))
+    monkeypatch.setattr(checkpoints, "__file__", str(Path("models/checkpoint.py").absolute()))
     untrained(Path("model.safetensors"), task="robot")
     if "test/line-v0" in arguments:
         write_dataset(line_store(side=64))

@@ -133,6 +133,6 @@ def released_checkpoint(task: str) -> Path:
     """The checkpoint of a task that is shipped with the package; in a checkout the package links to `checkpoints/`."""
     path = Path(__file__).resolve().parents[1] / "checkpoints" / f"{get_task(task).name}.safetensors"
     if not path.is_file():
-        raise CheckpointError(f"no checkpoint of {task} is shipped with this velap: expected {path}. Train one with "
+        raise CheckpointError(f"no released checkpoint of {task}: expected it at {path}. Train one with "
                               f"`velap run {task}`, or name one with --checkpoint.")
     return path.resolve()

@@ -180,8 +180,8 @@ def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: in
         own = TASKS[player.key.task].dataset_id if player.key.task in TASKS else None
         dataset = own if own is not None and minari_io.exists(own) else None
     if dataset is not None:
-        recorded = open_recorded(dataset, player.key.image_key or player.reading.image_key or None, player.model,
-                                 player.config, {"seed": str(player.key.train_seed)})
+        metadata = {"seed": str(player.key.train_seed), "reading": player.reading.to_json()}
+        recorded = open_recorded(dataset, player.key.image_key, player.model, player.config, metadata)
         states = real_states_of(player.model, recorded, rng, count)
         return Backdrop(source=f"the dataset {dataset}", latents=states.latents.cpu().numpy(), frames=states.frames)
     bank = getattr(player.model, "bank_latents", torch.empty(0))

@@ -169,7 +169,7 @@ def run_diagnose(console: Console, request: Request) -> Diagnosis:
     config = override(config, **dict(request.changes or {}))
     player = None if subject.evaluation is None else load_player(subject.evaluation)
     with console.status(f"reading {subject.dataset_id}"):
-        recorded = open_recorded(subject.dataset_id, request.image_key, model, config, metadata)
+        recorded = open_recorded(subject.dataset_id, request.image_key, model, config, metadata, request.success)
     out = request.out or Path("runs/diagnosis") / subject.name.replace("/", "_")
     with only_writer(out, "a diagnosis"):
         diagnosis = _measure(console, request, subject, model, config, recorded, player)

@@ -16,7 +16,7 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from velap.config import Config
-from velap.data.frames import FrameStore
+from velap.data.frames import FrameStore, Reading
 from velap.data.loading import load_store
 from velap.data.minari_io import load_positions
 from velap.data.sampling import WindowSampler
@@ -82,9 +82,12 @@ class Recorded:
 
 
 def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, config: Config,
-                  metadata: Mapping[str, str]) -> Recorded:
-    """Read a dataset for a model whose checkpoint has `metadata`; raises ConfigError where its actions do not fit."""
-    store = load_store(dataset_id, image_key, image_size=model.spaces.height)
+                  metadata: Mapping[str, str], success: str | None = None) -> Recorded:
+    """Read a dataset as the checkpoint with `metadata` says that its data were read, but for the camera and the rule of
+    success that are named; raises ConfigError where its actions do not fit the model."""
+    reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else Reading()
+    store = load_store(dataset_id, image_key or reading.image_key or None, image_size=model.spaces.height, fit=reading.fit,
+                       success=success or reading.success or None)
     if len(store.action_low) != model.action_dim:
         raise ConfigError(f"{dataset_id} has actions of {len(store.action_low)} entries, the checkpoint acts by "
                           f"{model.action_dim}; expected the same. Name the dataset that it was trained on with --dataset.")
