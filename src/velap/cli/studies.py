@@ -94,16 +94,44 @@ def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-late
         _study("experts").study_experts(OUT, quick, seed, write, json)
 
 
-def figure(name: Annotated[Positional[Literal["tasks", "tasks-widowx", "sawyer-drawing"]], arg(help="What to draw.")],
-           write: Path | None = None) -> None:
-    """Draw a picture of the documentation anew.
+def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-widowx", "sawyer-drawing"]],
+                           arg(help="Number of the paper's figure, or a picture of the documentation.")],
+           task: Annotated[Positional[str | None], arg(help="Of figure 3; by default both mazes.")] = None,
+           write: Path | None = None, checkpoint: Path | None = None, dataset: str | None = None,
+           image_key: str | None = None, device: Device = "auto", episodes: int = 50, no_run: bool = False,
+           fresh: bool = False) -> None:
+    """Make a figure of the paper, or draw a picture of the documentation anew.
 
-    `tasks`: test start and goal state of every task, as an agent sees them. `tasks-widowx`: an expert's episode of each task
-    of the WidowX arm. `sawyer-drawing`: our drawing of the Sawyer arm beside Meta-World's geometry.
+    `3`: the latent space, its values and planned paths. `7` and `8`: success against planning time in SpiralMaze and in
+    ObstacleMaze; interrupt them at any time, the same command goes on from there. `tasks`: test start and goal state of
+    every task, as an agent sees them. `tasks-widowx`: an expert's episode of each task of the WidowX arm. `sawyer-drawing`:
+    our drawing of the Sawyer arm beside Meta-World's geometry.
 
     Args:
-        write: Where it goes. Default: docs/NAME.png (with _ for -).
+        write: The PNG; figures of the paper get a PDF beside it. Default: docs/figures/figNUMBER.png or docs/NAME.png (with
+            _ for -); runs/figures for figure 3 of your own checkpoint or dataset.
+        checkpoint: Figures 3, 7, 8: `model.safetensors` of a run. Default: the released one.
+        dataset: Figure 3: states of this dataset instead of those of an environment seen from above; panels a and c stay
+            empty.
+        image_key: Figure 3: key of the image in dict observations.
+        device: Figure 3: where the networks run.
+        episodes: Figures 7 and 8: episodes a point, seeds from 1000.
+        no_run: Only draw what was made before.
+        fresh: Figures 7 and 8: move records of another checkpoint or config aside and make them anew.
     """
+    if name == "3":
+        from velap.report.latent_figure import show
+
+        show(OUT, task, checkpoint=checkpoint, dataset=dataset, image_key=image_key, device=device, no_run=no_run,
+             write=write)
+        return
+    if task is not None:
+        raise ConfigError(f"`velap figure {name}` got the task {task!r}; only figure 3 takes one. Leave it out.")
+    if name in ("7", "8"):
+        _study("planning_time").show_planning_time(
+            OUT, name, write or Path(f"docs/figures/fig{name}.png"), checkpoint=checkpoint, episodes=episodes, no_run=no_run,
+            fresh=fresh)
+        return
     path = write or Path("docs") / f"{name.replace('-', '_')}.png"
     if name == "tasks":
         _study("gallery").show_tasks(OUT, path)

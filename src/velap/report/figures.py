@@ -1,4 +1,5 @@
-"""The picture of Fig. 3: planned waypoints in the frame, latents and tree in a 2-D Isomap, Q^g over the robot's position.
+"""What pictures of a latent space consist of: states whose positions are known, the 2-D Isomap, the tree of a plan; and the
+picture of one plan.
 
 P probed states, D latent dimensions, L waypoints, M nodes of a tree, S frame size [px].
 """
@@ -59,16 +60,16 @@ def can_probe(env: gym.Env[Any, Any]) -> bool:
 
 @torch.inference_mode()
 def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, *, frame_stack: int, rng: np.random.Generator,
-          count: int = PROBES, seed: int = 0) -> LatentMap:
+          count: int = PROBES, seed: int = 0, options: dict[str, Any] | None = None) -> LatentMap:
     """Encode `count` states at uniform free positions, each after a few steps of one random action, as in the data.
 
-    `seed` is the environment's: it chooses the scene.
+    `seed` and `options` are those of the environment's reset: they choose the scene.
     """
     world: Any = env.unwrapped
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
     stacks, positions, actions = [], [], []
-    env.reset(seed=seed)
+    env.reset(seed=seed, options=options)
     for start in world.free_positions(rng, count):
         world.set_agent_position(start)
         action = rng.uniform(space.low, space.high).astype(space.dtype)
@@ -109,24 +110,52 @@ def plan_figure(path: Path, *, frame: NDArray[np.uint8], plan: Plan, row: int, l
         latent_map: where latents are in the world.
         title: above the picture.
     """
-    from matplotlib.colors import LogNorm
-
     waypoints = plan.waypoints[row, : plan.length[row]].float().cpu().numpy()
     size = int(plan.tree.size[row])
     nodes = plan.tree.latents[row, :size].float().cpu().numpy()
     parents = plan.tree.parents[row, :size].cpu().numpy()
-    shown = np.clip(latent_map.values, SMALLEST_SHOWN, 1)
-    colours = {"c": shown, "norm": LogNorm(SMALLEST_SHOWN, 1), "cmap": "viridis", "s": 14}
+    embedded, tree, chosen = embed(latent_map.latents, nodes, waypoints)
+    colours = value_colours(latent_map.values)
 
     figure = new_figure(15, 5, title)
     in_frame, in_latents, in_world = figure.subplots(1, 3)
     _draw_frame(in_frame, frame, latent_map, waypoints)
-    _draw_isomap(in_latents, latent_map, nodes, parents, waypoints, colours)
-    points = in_world.scatter(*latent_map.positions.T, **colours)
+    in_latents.scatter(*embedded.T, s=14, **colours)
+    draw_tree(in_latents, tree, parents, label=f"tree, {len(nodes)} nodes")
+    draw_path(in_latents, chosen, label="chosen path", start="now")
+    in_latents.set(title="2-D Isomap of latents", xticks=[], yticks=[])
+    in_latents.legend(loc="best", fontsize=8)
+    points = in_world.scatter(*latent_map.positions.T, s=14, **colours)
     in_world.set(title="$Q^g$ over the robot's position", xlabel="x [m]", ylabel="y [m]", aspect="equal",
                  xlim=latent_map.extent[:2], ylim=latent_map.extent[2:])
     figure.colorbar(points, ax=(in_latents, in_world), label="$Q^g$", shrink=0.9)
     save_figure(figure, path)
+
+
+def embed(latents: NDArray[np.float32], *others: NDArray[np.float32]) -> list[NDArray[np.float64]]:
+    """The plane [P, 2] that best keeps the distances of latents [P, D] along their manifold (Isomap), and where in it other
+    latents [*, D] lie."""
+    isomap = Isomap(n_neighbors=min(NEIGHBOURS, len(latents) - 1), n_components=2)
+    return [isomap.fit_transform(latents), *(isomap.transform(each) for each in others)]
+
+
+def value_colours(values: NDArray[np.float32]) -> dict[str, Any]:
+    """Arguments of matplotlib's `scatter` for Q^g [P]: a logarithmic scale whose lightness grows with the value."""
+    from matplotlib.colors import LogNorm
+
+    return {"c": np.clip(values, SMALLEST_SHOWN, 1), "norm": LogNorm(SMALLEST_SHOWN, 1), "cmap": "viridis"}
+
+
+def draw_tree(axes: Any, tree: NDArray[np.floating[Any]], parents: NDArray[np.int64], label: str) -> None:
+    """The edges of a tree, nodes [M, 2], parents [M]."""
+    edges = np.stack([tree[1:], tree[parents[1:]], np.full_like(tree[1:], np.nan)], 1).reshape(-1, 2)
+    axes.plot(*edges.T, color="0.25", linewidth=0.6, alpha=0.7, label=label)
+
+
+def draw_path(axes: Any, path: NDArray[np.floating[Any]], label: str, start: str) -> None:
+    """A planned path [L, 2] from its start."""
+    axes.plot(*path.T, "o-", color="tab:red", markersize=4, linewidth=2, label=label)
+    axes.plot(*path[0], "*", color="black", markersize=13, label=start)
 
 
 def new_figure(width: float, height: float, title: str) -> Any:
@@ -141,9 +170,9 @@ def new_figure(width: float, height: float, title: str) -> Any:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """A whole PNG or none; raises StorageError."""
-    content = io.BytesIO()
-    figure.savefig(content, dpi=110, format="png")
+    """A whole file or none, PNG or vector by the name; the same figure gives the same bytes. Raises StorageError."""
+    kind, content = path.suffix.removeprefix("."), io.BytesIO()
+    figure.savefig(content, dpi=110, format=kind, metadata={"CreationDate": None} if kind == "pdf" else None)
     write_atomic(path, content.getvalue())
 
 
@@ -152,18 +181,3 @@ def _draw_frame(axes: Any, frame: NDArray[np.uint8], latent_map: LatentMap, wayp
     axes.imshow(frame, extent=latent_map.extent, interpolation="nearest")
     axes.plot(*latent_map.locate(waypoints).T, "o-", color="tab:orange", markersize=5, linewidth=1.5)
     axes.set(title=f"frame and {len(waypoints) - 1} planned waypoints", xlabel="x [m]", ylabel="y [m]")
-
-
-def _draw_isomap(axes: Any, latent_map: LatentMap, nodes: NDArray[np.float32], parents: NDArray[np.int64],
-                 waypoints: NDArray[np.float32], colours: dict[str, Any]) -> None:
-    """Probed latents in the plane that keeps their distances along the manifold best, with the tree and the chosen path."""
-    isomap = Isomap(n_neighbors=NEIGHBOURS, n_components=2)
-    embedded = isomap.fit_transform(latent_map.latents)
-    tree, path = isomap.transform(nodes), isomap.transform(waypoints)
-    axes.scatter(*embedded.T, **colours)
-    edges = np.stack([tree[1:], tree[parents[1:]], np.full_like(tree[1:], np.nan)], 1).reshape(-1, 2)
-    axes.plot(*edges.T, color="0.25", linewidth=0.6, alpha=0.7, label=f"tree, {len(nodes)} nodes")
-    axes.plot(*path.T, "o-", color="tab:red", markersize=4, linewidth=2, label="chosen path")
-    axes.plot(*path[0], "*", color="black", markersize=13, label="now")
-    axes.set(title="2-D Isomap of latents", xticks=[], yticks=[])
-    axes.legend(loc="best", fontsize=8)
