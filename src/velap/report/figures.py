@@ -15,7 +15,9 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from sklearn.manifold import Isomap
+from sklearn.neighbors import kneighbors_graph
 
 from velap.data.frames import stack_indices
 from velap.envs.protocol import Mapped
@@ -26,8 +28,9 @@ from velap.search.types import Plan
 
 PROBES = 1200
 """States a latent map is made of. ours: about one per hundredth of SpiralMaze's corridor."""
-NEIGHBOURS = 10
-"""Neighbours of the Isomap graph. ours."""
+NEIGHBOURS = 5
+"""Fewest neighbours of the Isomap graph. ours; more only where the graph would fall apart: in SpiralMaze, further ones are
+across a wall."""
 SMALLEST_SHOWN = 1e-3
 """Lower end of the logarithmic colours [Q-value]. ours: γ^169."""
 
@@ -135,8 +138,14 @@ def plan_figure(path: Path, *, frame: NDArray[np.uint8], plan: Plan, row: int, l
 def embed(latents: NDArray[np.float32], *others: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     """The plane [P, 2] that best keeps the distances of latents [P, D] along their manifold (Isomap), and where in it other
     latents [*, D] lie."""
-    isomap = Isomap(n_neighbors=min(NEIGHBOURS, len(latents) - 1), n_components=2)
+    isomap = Isomap(n_neighbors=_enough_neighbours(latents), n_components=2)
     return [isomap.fit_transform(latents), *(isomap.transform(each) for each in others)]
+
+
+def _enough_neighbours(latents: NDArray[np.float32]) -> int:
+    """The fewest neighbours, `NEIGHBOURS` or more, that keep the graph of latents [P, D] in one piece."""
+    counts = range(min(NEIGHBOURS, len(latents) - 1), len(latents))
+    return next(count for count in counts if connected_components(kneighbors_graph(latents, count), directed=False)[0] == 1)
 
 
 def value_colours(values: NDArray[np.float32]) -> dict[str, Any]:

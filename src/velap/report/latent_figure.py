@@ -187,8 +187,7 @@ def draw(rows: Sequence[LatentSpace], *paths: Path) -> None:
     grid = figure.subplots(len(rows), 6, squeeze=False)
     for number, (row, axes) in enumerate(zip(rows, grid, strict=True)):
         _draw_row(figure, row, axes)
-        axes[0].annotate(row.title, (-0.3, 0.5), xycoords="axes fraction", rotation=90, va="center", ha="center",
-                         fontsize=11)
+        axes[0].text(-0.42, 0.5, row.title, transform=axes[0].transAxes, rotation=90, va="center", ha="center", fontsize=11)
         if number == 0:
             colours = "colours of (a)" if len(row.positions) else "time in episode"
             titles = ("(a) robot positions", f"(b) Isomap, {colours}", "(c) $Q^g$ over positions",
@@ -217,6 +216,7 @@ def _draw_row(figure: Any, row: LatentSpace, axes: Any) -> None:
     else:
         for empty in (positions, values_there):
             empty.axis("off")
+            empty.set_box_aspect(1)
             empty.text(0.5, 0.5, "positions unknown", ha="center", va="center", transform=empty.transAxes, color="0.4")
     points = isomap.scatter(*row.plane.T, s=7, **tints)
     if not known:
@@ -230,7 +230,7 @@ def _draw_row(figure: Any, row: LatentSpace, axes: Any) -> None:
     for path in row.paths:
         draw_path(planned, path[np.isfinite(path[:, 0])], label="planned path", start="start")
     for each in (isomap, values_here, planned):
-        each.set(xticks=[], yticks=[], xlabel="Isomap 1", ylabel="Isomap 2")
+        each.set(xticks=[], yticks=[], xlabel="Isomap 1", ylabel="Isomap 2", box_aspect=1)
 
 
 def position_colours(positions: NDArray[np.floating[Any]], extent: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -246,7 +246,8 @@ def _draw_world(axes: Any, row: LatentSpace, **points: Any) -> None:
     """The positions over the scene."""
     axes.imshow(row.background, extent=tuple(row.extent), interpolation="nearest", alpha=0.45)
     axes.scatter(*row.positions.T, **points)
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=row.extent[:2], ylim=row.extent[2:])
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", box_aspect=1,
+             xlim=row.extent[:2], ylim=row.extent[2:])
 
 
 def _number(axes: Any, places: NDArray[np.floating[Any]]) -> None:
