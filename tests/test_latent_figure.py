@@ -58,6 +58,18 @@ def test_a_dataset_gives_what_it_knows(tmp_path: Path) -> None:
         of_data(model, config, "noise", few)
 
 
+def test_the_command_draws_any_checkpoint_and_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = noise_store(episodes=8)
+    joint_checkpoint(tmp_path / "model.safetensors", store)
+    np.savez(tmp_path / "data.npz", observations=store.frames, actions=store.actions, rewards=store.rewards,
+             terminals=(store.last == np.arange(len(store.last))).astype(float))
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["figure", "3", "mine", "--checkpoint", "model.safetensors", "--dataset", "data.npz"]) == 0
+    (space,) = load(latent_figure.OWN_DATA / "fig3-mine.npz")
+    assert space.title == "mine" and len(space.positions) == 0 and len(space.plane) > 30
+    assert {path.name for path in latent_figure.OWN_DATA.iterdir()} == {"fig3-mine.npz", "fig3-mine.png", "fig3-mine.pdf"}
+
+
 def test_a_file_keeps_all(toy: LatentSpace, tmp_path: Path) -> None:
     save(tmp_path / "toy.npz", [toy, replace(toy, title="again")])
     first, second = load(tmp_path / "toy.npz")

@@ -286,7 +286,7 @@ def spaces_of(task: str, checkpoint: Path | None, dataset: str | None, image_key
     model, config, metadata = load_checkpoint(path, pick_device(device))
     reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else Reading()
     source = dataset or (TASKS[task].dataset_id if task in TASKS else task)
-    store = load_store(source, image_key or reading.image_key or None, image_size=reading.image_size, fit=reading.fit,
+    store = load_store(source, image_key or reading.image_key or None, image_size=model.spaces.height, fit=reading.fit,
                        success=reading.success or None)
     return [of_data(model, config, task, store)]
 
