@@ -18,7 +18,7 @@ from velap.errors import ConfigError
 from velap.evaluation.evaluate import Evaluation, evaluate
 from velap.evaluation.records import read_records, record_path
 from velap.evaluation.summary import Summary, markdown_rows, summarise, write_into
-from velap.report.demo import released_checkpoint
+from velap.models.checkpoint import released_checkpoint
 from velap.report.figures import new_figure, save_figure
 
 RECORDS = Path("results/planning_time")
@@ -174,6 +174,7 @@ def draw(task: str, points: Sequence[Measured], *paths: Path) -> None:
         axes.plot([each.ms for each in front], [100 * each.rate for each in front], line, color=colour, linewidth=1.2,
                   drawstyle="steps-post")
         axes.plot([each.ms for each in own], [100 * each.rate for each in own], marker, color=colour, label=LABELS[method],
+                  markeredgewidth=1.8,
                   markersize=6 if method == "velap" else 9, markerfacecolor=colour if method == "velap" else "none")
         side = 1 if method == "velap" else -1
         for each in front:
