@@ -106,6 +106,7 @@ def test_settings_take_the_type_of_their_field() -> None:
     assert changes == {"planner": {"n_iter": 500, "anchor": "snap", "discard_low_exponent": None},
                        "train": {"joint": {"c1": 1}}}
     assert override(make_config("SpiralMaze"), **changes).train.phases[0].c1 == 1.0
+    assert override(make_config("SpiralMaze"), **parse_settings([["planner.anchor=none"]])).planner.anchor == "none"
     own = {"velap": get_method("velap").settings}
     assert parse_settings([["velap.planner=mine"]], own) == {"velap": {"planner": "mine"}}
     with pytest.raises(ConfigError, match=r"velap\.planner` is 3; expected str"):

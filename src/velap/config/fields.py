@@ -53,6 +53,8 @@ def typed(value: Any, hint: Any, name: str) -> Any:
     """`value`, as JSON gives it, in the type `hint`; raises ConfigError where it has another one. Whole numbers are floats
     too, and nothing else changes its type."""
     if get_origin(hint) is Literal:
+        if value is None and "none" in get_args(hint):
+            return "none"  # as `--set` reads the word where null may be meant
         good = any(value == choice and type(value) is type(choice) for choice in get_args(hint))
     elif get_origin(hint) in (Union, types.UnionType):
         for part in get_args(hint):
