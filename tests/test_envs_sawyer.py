@@ -211,7 +211,7 @@ def test_the_paper_preset_keeps_tables_7_to_9():
     for name in SAWYER:
         config, wall = make_config(name, "paper"), name == "ButtonWall"
         assert config.train.c3 == 0.5
-        assert config.train.c1 == 0.01
+        assert [phase.c1 for phase in config.train.phases] == [0.01]
         assert config.planner.n_iter == (500 if wall else 250)
         assert config.planner.n_sim == (10 if name in ("ButtonWall", "DrawerButton") else 5)
         assert config.controller.n_replan == (25 if wall else 15)
