@@ -6,7 +6,9 @@ import dataclasses
 import json
 import os
 import signal
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -231,3 +233,11 @@ def test_weights_hash_does_not_depend_on_how_long_training_took(tmp_path):
         hashes.append(load_tensors(tmp_path / name / MODEL)[1])
     assert hashes[0]["weights_sha256"] == hashes[1]["weights_sha256"]
     assert hashes[0]["sha256"] != hashes[1]["sha256"]
+
+
+def test_held_out_frames_that_never_change_have_no_step_length(tmp_path: Path) -> None:
+    store = make_store(episodes=40)
+    still = dataclasses.replace(store, frames=np.zeros_like(store.frames))
+    report = Trainer(config(), still, tmp_path, seed=0, device=torch.device("cpu")).report()
+    assert report["latent/step"] == 0
+    assert np.isnan(report["rollout/error_1"])

@@ -192,15 +192,13 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
     from velap.evaluation.evaluate import Evaluation, load_method
     from velap.methods.base import get_method, make_agent
 
-    if not get_method(method).needs_model:
-        raise ConfigError(f"the method {method!r} acts without a checkpoint; expected one that acts by it. Evaluate it by "
-                          f"velap.evaluate(TASK, method={method!r}).")
-    loaded = load_method(Evaluation("", method=method, checkpoint=Path(checkpoint), device=device, changes=changes,
-                                    head=None if head is None else Path(head)))
+    by_model = get_method(method).needs_model  # one that needs no model takes the bounds of its actions alone
+    loaded = load_method(Evaluation("", method=method if by_model else "velap", checkpoint=Path(checkpoint), device=device,
+                                    changes=changes, head=None if head is None else Path(head)))
     assert loaded.model is not None
     low, high = np.array([loaded.model.spaces.action_low, loaded.model.spaces.action_high], np.float32)
     return make_agent(method, loaded.model, loaded.config, gym.spaces.Box(low, high, dtype=np.float32), loaded.head,
-                      loaded.settings)
+                      loaded.settings if by_model else None)
 
 
 def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,

@@ -75,15 +75,16 @@ def diagnose(
 ) -> dict[str, float]:
     """Rollout error and displacement (in one-step lengths), and Q^l in steps, at each of `HORIZONS`; `horizons` in numbers.
 
-    Keys: `rollout/error_k`, `rollout/moved_k` [one-step lengths], `local/steps_k` [steps], `latent/step` [latent distance].
+    Keys: `rollout/error_k`, `rollout/moved_k` [one-step lengths, NaN where held-out frames do not change], `local/steps_k`
+    [steps], `latent/step` [latent distance].
     """
     report: dict[str, float] = {}
     one_step = float("nan")
     for horizon in horizons(model, sampler, episodes, HORIZONS, cache):
         moved = horizon.moved.mean().item()
         if horizon.length == 1:
-            one_step = moved
-            report["latent/step"] = one_step
+            report["latent/step"] = moved
+            one_step = moved if moved > 0 else one_step
         report[f"rollout/error_{horizon.length}"] = horizon.error.mean().item() / one_step
         report[f"rollout/moved_{horizon.length}"] = moved / one_step
         report[f"local/steps_{horizon.length}"] = horizon.local_steps.median().item()
