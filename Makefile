@@ -5,7 +5,7 @@ demo: setup
 	.venv/bin/velap demo
 
 test: check
-	OMP_NUM_THREADS=1 .venv/bin/python -m pytest
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest --cov=velap --cov-report=term:skip-covered --cov-fail-under=95
 
 check: setup
 	.venv/bin/ruff check .

@@ -57,7 +57,8 @@ def backdrop(player: Player) -> Backdrop:
 @pytest.fixture(scope="module")
 def subject(player: Player) -> Subject:
     episodes = [Episode(SEED, True, 21, False, ()), Episode(4, False, 60, True, ())]
-    return Subject(player=player, seed=SEED, records=tuple(to_record(player, episode, 1) for episode in episodes))
+    records = tuple(to_record(player.key, episode, 1, player.device) for episode in episodes)
+    return Subject(player=player, seed=SEED, records=records)
 
 
 # the trace
@@ -306,7 +307,7 @@ def toy_at_hand(monkeypatch: pytest.MonkeyPatch) -> Callable[[Player], None]:
 
 
 def record_file(player: Player, path: Path, seeds: tuple[int, ...]) -> Path:
-    lines = [to_record(player, Episode(seed, seed != 2, 21, seed == 2, ()), 1).to_json() for seed in seeds]
+    lines = [to_record(player.key, Episode(seed, seed != 2, 21, seed == 2, ()), 1, "cpu").to_json() for seed in seeds]
     path.write_text("\n".join(lines) + "\n")
     return path
 
