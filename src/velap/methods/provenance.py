@@ -26,6 +26,7 @@ from velap.methods.waypoints import Plans
 from velap.models.horizon import q_from_steps, steps_from_q
 from velap.models.velap import LatentModel
 from velap.registry import register_method
+from velap.search.risk import measured_risk
 from velap.search.provenance import Provenance, plan
 
 PATIENCE = 2
@@ -44,7 +45,7 @@ def planner_config(config: Config) -> PlannerConfig:
 class ProvenanceAgent:
     """Plans when a plan is used up, broken or `n_replan` steps old, and hands over to π^g near the goal."""
 
-    def __init__(self, model: LatentModel, config: Config, risk: float) -> None:
+    def __init__(self, model: LatentModel, config: Config, missed: float, cost: float) -> None:
         self.method = "velap-provenance"
         self.frame_stack = config.model.frame_stack
         self.last_plan_ms: NDArray[np.float64] = np.empty(0)
@@ -53,11 +54,15 @@ class ProvenanceAgent:
         self.last_plan_rows: NDArray[np.int64] = np.empty(0, np.int64)
         """Rows of `last_plan`."""
         self._states, self._fns = StateEncoder(model), model.search_fns()
-        self._search, self._risk = planner_config(config), risk
+        self._search = planner_config(config)
         self._local_policy = local_policy_of(CONTROLLER, model)
         cloned = self._fns.act_success
         self.policies = (self._fns.act_global, *([] if cloned is None else [cloned]))
         """What proposes besides g: π^g, and the policy cloned from successes where the model has one."""
+        states = model.bank_latents[model.bank_rows >= 0].float()
+        with torch.inference_mode():
+            self._risk = measured_risk(self._fns, self.policies, states, missed)
+        print("risk", self._risk)
         self._stop_value = q_from_steps(CONTROLLER.stop_exponent, self._fns.discount)
         self._reached_value = q_from_steps(CONTROLLER.waypoint_exponent, self._fns.discount)
         self._device = next(model.parameters()).device
@@ -198,8 +203,8 @@ def _widened(held: Tensor, width: int) -> Tensor:
 class ProvenanceSettings:
     """What the search trusts."""
 
-    risk: float = 30.0
-    """Risk of an edge of g [steps]. ours: one value for all tasks, see `docs/experiments`."""
+    missed: float = 0.2
+    cost: float = 150.0
 
 
 @register_method("velap-provenance")
@@ -212,7 +217,7 @@ class VelapProvenance(Method):
 
     def agent(self, parts: Parts) -> Agent:
         """The loop around the search with provenance."""
-        return ProvenanceAgent(parts.model, parts.config, parts.settings.risk)
+        return ProvenanceAgent(parts.model, parts.config, parts.settings.missed, parts.settings.cost)
 
     def legacy_hash(self, config: Config, head: Any = None, settings: Any = None) -> str | None:
         """None: velap 0.1 had no such method."""

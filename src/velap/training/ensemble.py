@@ -26,6 +26,7 @@ from velap.losses import Info, cloning_error, critic_loss, global_critic_loss, p
 from velap.models.networks import CRITIC, POLICY, EnsembleMLP
 from velap.models.velap import UNREWARDED
 from velap.training.capture import adam
+from velap.training.encoding import evaluated
 from velap.training.phase import FROZEN_RATE, Frozen, PhaseLearner, Run
 from velap.training.steps import cosine
 
@@ -68,6 +69,29 @@ def held_transitions(sampler: WindowSampler, steps: int, discount: float) -> Hel
     return HeldTransitions(actions / taken[:, None], rewards, alive * discount ** (taken - 1), at)
 
 
+HORIZON = 10
+"""Steps after which h's errors count [steps]. ours."""
+
+
+@torch.no_grad()
+def model_errors(run: Run, latents: Tensor) -> Tensor:
+    """Root mean square error of h in every dimension after `HORIZON` steps of the data: float32 [D].
+
+    What h cannot predict is noise to who follows its predictions.
+    """
+    sampler = run.sampler
+    rows = sampler.transitions
+    rows = rows[rows + HORIZON <= sampler.last[rows]]
+    if len(rows) == 0:
+        return torch.zeros(latents.shape[1], device=latents.device)
+    rows = rows[torch.linspace(0, len(rows) - 1, min(len(rows), 4_000), device=rows.device).long()]
+    with evaluated(run.model):
+        z = latents[rows]
+        for step in range(HORIZON):
+            z = run.model.step(z, sampler.actions[rows + step])
+    return (z - latents[rows + HORIZON]).square().mean(0).sqrt()
+
+
 class EnsembleLearner(PhaseLearner[EnsemblePhase]):
     """E pairs of policy and critics by Eq. 4 and 5; each draws transitions of its own. Then the model's policy is taught."""
 
@@ -95,8 +119,8 @@ class EnsembleLearner(PhaseLearner[EnsemblePhase]):
         learnt = {"critics": [*self.critics.parameters()], "policies": [*self.policies.parameters()],
                   "taught": [*taught.parameters(), *values]}
         self.optimizers = {name: adam(parameters, FROZEN_RATE) for name, parameters in learnt.items()}
-        self.deviation = self.latents.std(0)
-        """float32 [D], of each dimension over the data."""
+        self.deviation = model_errors(run, self.latents)
+        """float32 [D], what h errs by in each dimension."""
 
     def begin(self) -> None:
         """Held members have random numbers of their own."""
