@@ -26,8 +26,8 @@ from velap.methods.waypoints import Plans
 from velap.models.horizon import q_from_steps, steps_from_q
 from velap.models.velap import LatentModel
 from velap.registry import register_method
-from velap.search.risk import measured_risk
 from velap.search.provenance import Provenance, plan
+from velap.search.risk import measured_risk
 
 PATIENCE = 2
 """An edge of g is broken when it is not walked after this many times n_sim steps. ours."""

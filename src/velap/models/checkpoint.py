@@ -29,6 +29,8 @@ SHARED_SHA256 = "shared_sha256"
 SHARED = ("encoder.", "command_weight", "action_", "dynamics.", "global_policy.", "global_critic.")
 """Beginnings of the names of weights that heads and other methods act by: φ, g, h, π^g and Q^g; `action_` is g and the
 bounds."""
+YOUNGER = ("missed", "bank_gap")
+"""Tensors that the first files lack."""
 HALF_ABOVE = 3_000_000
 """Weights larger than this are stored in half precision, which keeps a released file below it [bytes]. ours."""
 
@@ -116,6 +118,7 @@ def save_folder(model: LatentModel, folder: Path, config: Config | None) -> Path
 def restore(module: nn.Module, tensors: Mapping[str, Tensor], path: Path | str) -> None:
     """Load weights into a module built from the file's own config; raises CheckpointError where names or shapes differ."""
     expected = module.state_dict()
+    tensors = {**{name: expected[name] for name in YOUNGER if name in expected}, **tensors}
     wrong = sorted(
         name
         for name in expected.keys() | tensors.keys()

@@ -21,8 +21,8 @@ from torch.nn import functional as F
 from velap.config.planning import PlannerConfig
 from velap.models.horizon import steps_from_q
 from velap.search.est import Thresholds, thresholds
-from velap.search.risk import Policy, Risk
 from velap.search.neighbours import candidate_neighbours, first_come, gained_neighbours, incoming_q
+from velap.search.risk import Policy, Risk
 from velap.search.sampling import Noise, draw_noise, node_distribution, sample_nodes
 from velap.search.simulation import anchored, simulate, value_where
 from velap.search.tree import Candidates, free_slots, insert_, new_tree, take, trace_back, trimmed

@@ -35,7 +35,7 @@ from velap.models.checkpoint import make_model, save_checkpoint
 from velap.models.velap import Spaces
 from velap.runs import make_generator, only_writer, write_atomic
 from velap.training.clone import CloneLearner
-from velap.training.diagnostics import diagnose, measure_latents
+from velap.training.diagnostics import diagnose, measure_latents, measure_trust
 from velap.training.encoder import EncoderLearner
 from velap.training.ensemble import EnsembleLearner
 from velap.training.joint import JointLearner
@@ -157,12 +157,14 @@ class Trainer:
 
     def report(self) -> dict[str, float]:
         """Diagnostics on held-out episodes."""
-        episodes = [
-            (int(self.store.episode_start[e]), int(self.store.episode_start[e] + self.store.episode_length[e]))
-            for e in self.holdout
-        ]
+        episodes = self._held_out()
         latents = None if self.frozen is None else self.frozen.latents
         return diagnose(self.model, self.sampler, episodes, latents) if episodes else {}
+
+    def _held_out(self) -> list[tuple[int, int]]:
+        """First and last row of every held-out episode."""
+        starts, lengths = self.store.episode_start[self.holdout], self.store.episode_length[self.holdout]
+        return [(int(start), int(start + length)) for start, length in zip(starts, lengths, strict=True)]
 
     def _modules(self) -> dict[str, nn.Module]:
         """Networks of the run by name, those of the current phase included."""
@@ -225,6 +227,7 @@ class Trainer:
         diagnostics = self.report()
         self.model.eval()
         measure_latents(self.model, self.sampler, make_generator(self.seed, stream=2))
+        measure_trust(self.model, self.sampler, self._held_out(), None if self.frozen is None else self.frozen.latents)
         provenance = {
             "command": command,
             "seed": str(self.seed),

@@ -49,7 +49,7 @@ class Encoder(nn.Module):
         """
         return self.measure(frames)
 
-    def complete(self, frames: Tensor, last: Tensor, seed: int) -> None:  # noqa: B027 - most encoders are complete
+    def complete(self, frames: Tensor, last: Tensor, seed: int) -> None:
         """Learn what the frozen encoder adds to what it learnt; arguments as in `fit`."""
 
     def measure(self, frames: Tensor) -> Tensor:
