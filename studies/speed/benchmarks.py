@@ -204,7 +204,7 @@ def _roots(model: LatentModel, batch: int) -> Tensor:
     return model.encode(frames.to(model.bank_latents.device))
 
 
-def _plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int = PlannerConfig().n_sim) -> Measurement:
+def _plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int = 5) -> Measurement:
     """Latency per environment of a VELAP plan for `batch` environments at once against MPPI with the same model."""
     model, planner, kind = _planning_model(device)
     planner = replace(planner, n_sim=n_sim)

@@ -44,9 +44,7 @@ def in_paper_order(names: Sequence[str], order: Sequence[str]) -> tuple[str, ...
 
 TASK_ORDER = in_paper_order([name for name in TASKS if name not in {task.name for task in ROBOT_TASKS}], PAPER_TASKS)
 """Tasks of the table; those of the robot belong to Table 11."""
-NOT_PLAYED = ("velap-provenance",)
-"""Methods without records on test seeds: they are still being chosen on validation seeds."""
-METHOD_ORDER = in_paper_order(tuple(name for name in METHODS if name not in NOT_PLAYED), ROWS)
+METHOD_ORDER = in_paper_order(tuple(METHODS), ROWS)
 
 
 @dataclass(frozen=True, order=True)
@@ -167,25 +165,22 @@ def record_problem(cell: Cell, records: Sequence[Record]) -> str:
         "env_kwargs": {}, "image_key": None, "max_steps": task.max_steps, "config_hash": config_hash}
     if joint is not None:
         expected["checkpoint"] = joint[WEIGHTS_SHA256] if method.whole_checkpoint else shared_weights(joint)
-    same = {"config_hash": expected_hash(cell, legacy=True)}
     for name, value in expected.items():
         found = {str(getattr(record, name)): getattr(record, name) for record in records}
-        others = sorted(text[:12] for text, got in found.items() if got != value and got != same.get(name, value))
+        others = sorted(text[:12] for text, got in found.items() if got != value)
         if others:
             return f"its `{name}` is {', '.join(others)}, that of today {str(value)[:12]}"
     return ""
 
 
-def expected_hash(cell: Cell, legacy: bool = False) -> str | None:
-    """The `config_hash` that an evaluation of the cell writes today, or that velap 0.1 wrote (`legacy`); None where its head
-    is not known."""
+def expected_hash(cell: Cell) -> str | None:
+    """The `config_hash` that an evaluation of the cell writes today; None where its head is not known."""
     config, method = make_config(cell.task, cell.preset), get_method(cell.method)
-    hash_of = method.legacy_hash if legacy else method.config_hash
     if cell.head is None:
-        return hash_of(config)
+        return method.config_hash(config)
     metadata = file_metadata(cell.head)
     weights = metadata[WEIGHTS_SHA256] if metadata is not None else training_notes().get(cell.names[1], {}).get("identity")
-    return None if weights is None else hash_of(config, _Head(head_settings(cell), weights))
+    return None if weights is None else method.config_hash(config, _Head(head_settings(cell), weights))
 
 
 @dataclass

@@ -114,7 +114,6 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
     """
     from velap.api import config_for
     from velap.cli.evaluate import evaluate_with_progress
-    from velap.config import legacy_hash
     from velap.data import minari_io
     from velap.evaluation.evaluate import Evaluation
     from velap.evaluation.records import check_config, record_path
@@ -123,7 +122,7 @@ def run(task: Task, preset: Preset = "default", seed: int = 0, episodes: int = 1
     dataset_id = get_task(task).dataset_id
     if not fresh:
         config = config_for(task, preset, parse_settings(settings))
-        check_config(record_path(records, task, "velap", preset, seed), config.hash(), legacy_hash(config))
+        check_config(record_path(records, task, "velap", preset, seed), config.hash())
     if not minari_io.exists(dataset_id):
         collect(task, workers=workers)
     checkpoint = train_with_progress(task, preset=preset, seed=seed, out=out, device=device, resume=True, settings=settings)

@@ -1,6 +1,5 @@
 """Frozen, typed configuration. Each default cites the table of the paper it comes from, or says `ours` and why."""
 
-from velap.config.migrate_v1 import legacy_hash
 from velap.config.model import ModelConfig, Norm
 from velap.config.planning import ControllerConfig, PlannerConfig
 from velap.config.serialise import Config, describe, override
@@ -17,5 +16,5 @@ from velap.config.training import (
 
 __all__ = [
     "ClonePhase", "Config", "ControllerConfig", "EncoderPhase", "EnsemblePhase", "JointPhase", "LatentPhase", "ModelConfig",
-    "Norm", "Phase", "PlannerConfig", "TrainConfig", "ValuePhase", "describe", "legacy_hash", "override",
+    "Norm", "Phase", "PlannerConfig", "TrainConfig", "ValuePhase", "describe", "override",
 ]

@@ -7,47 +7,52 @@ from typing import Literal, get_args
 
 from velap.config.fields import require
 
-Anchor = Literal["none", "snap"]
+Anchor = Literal["auto", "none", "snap"]
 Precision = Literal["float32", "bfloat16"]
 NEIGHBOUR_DISTANCE = 3.0
 """d_neigh in upper 5-percentiles of one-step latent distances, Table 8."""
-HELD_TURN = 8
-"""Steps that the held policy and π^g lead in turns, the held policy first [steps]. ours: where one of them stands still the
-other seldom does."""
+SNAP_GAP = 0.5
+"""Where `auto` anchors, most held-out latents lie nearer to the bank than this [one-step distances]. ours: an anchor then moves
+a candidate by less than half a step and undoes errors of h that lead nowhere real. Where the bank has wider gaps, anchors move
+candidates by as much as a step does."""
 
 
 @dataclass(frozen=True)
 class PlannerConfig:
     """Tree search (Algorithm 1, Eq. 6-8, Table 8, App. B.6). Thresholds on Q are given as exponents of γ, as in Table 8."""
 
-    n_iter: int = 250
-    """Expansions a plan, Table 8 (500 in ButtonWall). Counts candidates, not rounds."""
-    n_sim: int = 5
-    """Simulated steps an expansion [steps], Table 8 (10 in SpiralMaze, ButtonWall, DrawerButton)."""
-    candidates: int = 50
-    """K, candidates a round (batch processing, App. B.6, which gives no number)."""
+    provenance: bool = True
+    """Edges remember what proposed them, carry its risk and are walked by it. ours; off in `paper`."""
+    n_iter: int = 500
+    """Expansions a plan, Table 8 (250 in the other tasks than ButtonWall). Counts candidates, not rounds."""
+    n_sim: int = 10
+    """Simulated steps an expansion [steps], Table 8 (5 in ObstacleMaze, WindowClose, FaucetClose)."""
+    candidates: int = 10
+    """K, candidates a round (batch processing, App. B.6, which gives no number). ours; 50 in `paper`."""
     discard_high_exponent: float = 2.0
     """τ_high = γ^this, Table 8: too close to a node of the tree."""
-    discard_low_exponent: float | None = None
-    """τ_low = γ^this; null reads it as n_sim, Table 8. ours may widen it: straight rollouts are exactly n_sim long."""
+    discard_low_exponent: float | None = 20.0
+    """τ_low = γ^this; null reads it as n_sim, Table 8. ours is wider: straight rollouts are exactly n_sim long."""
     neighbour_exponent: float = 3.0
     """τ_neigh = γ^this, Table 8."""
     goal_exponent: float = 5.0
     """τ_goal = γ^this, Table 8."""
-    p_sparse: float = 0.4
-    """p^sparse of the node sampling mixture. ours: the paper gives no number."""
-    p_value: float = 0.4
-    """p^value of the node sampling mixture; the rest is uniform. ours."""
+    p_sparse: float = 0.9
+    """p^sparse of the node sampling mixture. ours: the paper gives no number; 0.4 in `paper`."""
+    p_value: float = 0.1
+    """p^value of the node sampling mixture; the rest is uniform. ours; 0.4 in `paper`."""
     p_policy: float = 0.2
-    """p^policy: probability that an expansion acts by π^g instead of g. ours: the paper gives no number."""
-    expansion_weight: float = 0.0
+    """p^policy: probability that an expansion acts by π^g instead of g. ours: the paper gives no number. No effect with
+    `provenance`, where the policies have half of a round."""
+    expansion_weight: float = 1.0
     """Each expansion made from a node counts as this many neighbours in Eq. 6, so that explored surroundings are left alone.
     ours; 0 in `paper`."""
     coherent_noise: bool = True
     """Draw the action noise once a simulation instead of once a step (the data are correlated walks). ours; off in
     `paper`."""
-    anchor: Anchor = "none"
-    """`snap` moves a candidate to its nearest dataset latent and rejects one that is too far from it. ours."""
+    anchor: Anchor = "auto"
+    """`snap` moves a candidate to its nearest dataset latent and rejects one that is too far from it; `auto` snaps where
+    held-out latents lie within half a one-step distance of the bank. ours; `none` in `paper`."""
 
     def __post_init__(self) -> None:
         for name in ("n_iter", "n_sim", "candidates"):
@@ -72,33 +77,11 @@ class ControllerConfig:
     lookahead: int = 3
     """π^l competes with actions sampled from g, each held for this many simulated steps and judged by Q_min to the waypoint;
     0 acts by π^l alone [steps]. ours: π^l pushes into walls at corners that h knows of; 0 in `paper`."""
-    lookahead_gain: float = 1.0
+    lookahead_gain: float = 2.0
     """Above 1, the actions of the lookahead also compete multiplied by this and clipped to the limits. ours: g and π^l are
-    as slow as the data."""
-    shortcut_exponent: float = 0.0
-    """Above 0, go on to the farthest waypoint with Q_min above γ^this; 0 takes each in turn. ours: trees in open space
-    zigzag."""
-    residuals: int = 0
-    """Last steps of the episode whose prediction errors correct h in lookahead and plans; 0 disables it [steps]. ours."""
-    goal_lookahead: int = 0
-    """π^g competes with stronger versions of its action, each held for this many simulated steps and judged by Q^g; 0
-    disables it [steps]. ours."""
-    success_rollout: int = 0
-    """Simulate the cloned policy this far at every step; where it reaches a state with Q^g above τ_goal it acts and nothing
-    is planned; 0 disables it [steps]. ours: a policy that knows nothing of h hardly meets the errors that a search
-    exploits."""
-    success_exponent: float = 0.0
-    """The cloned policy acts where Q^g is above γ^this, as long as revisits leave the goal near (τ_stop); 0 disables it
-    [steps].
-    ours: the last steps to a success ask for more than Q^g tells, and what worked is in the data."""
-    revisit_penalty: float = 0.0
-    """Steps that each state of the episode adds to the goal distance of its surroundings; 0 trusts Q^g [steps]. ours: plans
-    and π^g then leave places that promise the goal and do not keep it."""
+    as slow as the data; 1 in `paper`."""
 
     def __post_init__(self) -> None:
         require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")
-        for name in ("lookahead", "shortcut_exponent", "residuals", "goal_lookahead", "success_rollout", "revisit_penalty"):
-            require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
+        require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
         require(self.lookahead_gain >= 1, "lookahead_gain", self.lookahead_gain, "a factor of 1 or more")
-        require(0 <= self.success_exponent <= self.stop_exponent, "success_exponent", self.success_exponent,
-                "0 to `stop_exponent` steps")

@@ -58,8 +58,10 @@ def paper(task: str) -> Config:
         TrainConfig(
             phases=(JointPhase(24_000, rewarded_share=0.0, c1=row.c1, windows=64, window=1),),
             c3=row.c3, target_rate=0.005, policy_every=1),
-        PlannerConfig(n_iter=row.n_iter, n_sim=row.n_sim, coherent_noise=False),
-        ControllerConfig(n_replan=row.n_replan, lookahead=0),
+        PlannerConfig(provenance=False, n_iter=row.n_iter, n_sim=row.n_sim, candidates=50, discard_high_exponent=2.0,
+                      discard_low_exponent=None, neighbour_exponent=3.0, goal_exponent=5.0, p_sparse=0.4, p_value=0.4,
+                      p_policy=0.2, expansion_weight=0.0, coherent_noise=False, anchor="none"),
+        ControllerConfig(n_replan=row.n_replan, stop_exponent=5.0, waypoint_exponent=3.0, lookahead=0, lookahead_gain=1.0),
     )
 
 
@@ -71,8 +73,6 @@ def foreign(task: str) -> Config:
         TrainConfig(
             phases=(JointPhase(5_000, reconstruction_side=16), LatentPhase(4_000)),
             group_windows=6, group_reach=4),
-        PlannerConfig(),
-        ControllerConfig(n_replan=8, waypoint_exponent=1.5, residuals=40),
     )
 
 
@@ -82,9 +82,6 @@ def spiral_maze(task: str) -> Config:
         task, "default",
         ModelConfig(frame_stack=1, bank_size=4096),
         TrainConfig(phases=(JointPhase(4_000, c1=0.02), LatentPhase(4_000))),
-        PlannerConfig(n_iter=1000, n_sim=10, discard_low_exponent=20.0, p_sparse=0.9, p_value=0.1, p_policy=0.1,
-                      expansion_weight=1.0, anchor="snap"),
-        ControllerConfig(n_replan=15),
     )
 
 
@@ -97,8 +94,6 @@ def obstacle_maze(task: str) -> Config:
             phases=(EncoderPhase(3_000), JointPhase(5_000, rewarded_share=0.01, c1=0.02, reconstruction_side=32),
                     LatentPhase(4_000, rewarded_share=0.01), ValuePhase(8_000, rewarded_share=0.01)),
             critic_loss="cross_entropy", group_windows=6, group_reach=4),
-        PlannerConfig(n_iter=500, discard_low_exponent=10.0, p_sparse=0.9, p_value=0.1, p_policy=0.1, expansion_weight=1.0),
-        ControllerConfig(n_replan=2, waypoint_exponent=1.5, residuals=40),
     )
 
 
@@ -112,8 +107,6 @@ def window_close(task: str) -> Config:
             phases=(EncoderPhase(8_000, pairs=128, inverse=1.0), LatentPhase(3_000, rewarded_share=0.0, horizon=20),
                     EnsemblePhase(5_000, members=5)),
             c0=1.0, c3=1.0, critic_loss="cross_entropy", group_windows=4),
-        SAWYER_PLANNER,
-        ControllerConfig(n_replan=25, stop_exponent=150.0, shortcut_exponent=12.0, lookahead_gain=2.0, revisit_penalty=8.0),
     )
 
 
@@ -127,9 +120,6 @@ def faucet_close(task: str) -> Config:
             phases=(EncoderPhase(3_000), JointPhase(1_500, c1=0.02, windows=64, window=3),
                     LatentPhase(3_000, rewarded_share=0.0, horizon=20), ClonePhase(8_000, candidates=8)),
             c0=1.0, c3=0.5, critic_loss="cross_entropy", group_windows=4),
-        SAWYER_PLANNER,
-        ControllerConfig(n_replan=25, stop_exponent=35.0, shortcut_exponent=12.0, lookahead_gain=2.0, goal_lookahead=3,
-                         success_rollout=150, revisit_penalty=1.0),
     )
 
 
@@ -143,8 +133,6 @@ def button_wall(task: str) -> Config:
             phases=(EncoderPhase(8_000, pairs=128, inverse=1.0), LatentPhase(3_000, rewarded_share=0.0, horizon=20),
                     EnsemblePhase(8_000, noise=0.15)),
             c0=1.0, c3=0.2, critic_loss="cross_entropy", critic_floor=0.005, group_windows=4),
-        SAWYER_PLANNER,
-        ControllerConfig(n_replan=25, stop_exponent=250.0, shortcut_exponent=12.0, lookahead_gain=2.0, revisit_penalty=8.0),
     )
 
 
@@ -156,17 +144,11 @@ def drawer_button(task: str) -> Config:
         ModelConfig(encoder="moments", command_dims=3),
         TrainConfig(
             phases=(EncoderPhase(8_000, pairs=128, inverse=1.0), LatentPhase(3_000, rewarded_share=0.0, horizon=20),
-                    EnsemblePhase(8_000, noise=0.15), EnsemblePhase(8_000, members=3, hold=5, noise=0.15),
-                    ClonePhase(3_000, reach=25)),
+                    EnsemblePhase(8_000, noise=0.15), ClonePhase(3_000)),
             c0=1.0, c3=0.1, critic_loss="cross_entropy", critic_floor=0.005, group_windows=4),
-        SAWYER_PLANNER,
-        ControllerConfig(n_replan=25, stop_exponent=250.0, shortcut_exponent=12.0, lookahead_gain=2.0, success_exponent=30.0,
-                         revisit_penalty=8.0),
     )
 
 
-SAWYER_PLANNER = PlannerConfig(n_iter=500, n_sim=10, discard_low_exponent=20.0, p_sparse=0.9, p_value=0.1, p_policy=0.1,
-                               expansion_weight=1.0)
 DEFAULTS: dict[str, Callable[[str], Config]] = {
     "SpiralMaze": spiral_maze, "ObstacleMaze": obstacle_maze, "WindowClose": window_close, "FaucetClose": faucet_close,
     "ButtonWall": button_wall, "DrawerButton": drawer_button,

@@ -14,8 +14,8 @@ from velap.config.planning import ControllerConfig, PlannerConfig
 from velap.config.training import PHASES, Phase, TrainConfig
 from velap.errors import ConfigError
 
-SCHEMA = 2
-"""Number of the JSON layout. Files without one are schema 1, which `velap.config.migrate_v1` reads."""
+SCHEMA = 3
+"""Number of the JSON layout. `velap.config.migrate` reads older files."""
 CADENCES = ("log_every", "checkpoint_every")
 """Fields of `TrainConfig` that decide no result and stay out of the hash."""
 PARTS: dict[str, type] = {
@@ -35,12 +35,11 @@ class Config:
     controller: ControllerConfig = dataclasses.field(default_factory=ControllerConfig)
 
     def __post_init__(self) -> None:
-        train, controller = self.train, self.controller
+        train = self.train
         require(self.model.critic_bounded or train.critic_loss == "mse", "critic_loss", train.critic_loss,
                 "'mse' where `critic_bounded` is off: cross entropy asks for Q-values in [0, 1]")
-        for name in ("success_rollout", "success_exponent"):
-            require(train.clones or getattr(controller, name) == 0, name, getattr(controller, name),
-                    "0 without a clone phase: there is no cloned policy")
+        require(self.model.bank_size > 0 or not self.planner.provenance, "provenance", self.planner.provenance,
+                "false where `bank_size` is 0: the risk of edges is measured on the bank")
 
     def to_dict(self) -> dict[str, Any]:
         """Every field by part, phases by kind."""
@@ -73,15 +72,15 @@ class Config:
         except json.JSONDecodeError as error:
             raise ConfigError(f"the config is not JSON ({error}); expected the text that velap saved. Restore the "
                               "file.") from error
-        if isinstance(raw, dict) and "schema" not in raw:
-            from velap.config.migrate_v1 import from_v1
+        schema = raw.get("schema", 1) if isinstance(raw, dict) else None
+        if schema in (1, 2):
+            from velap.config.migrate import from_older
 
-            return from_v1(raw)
-        schema = raw.get("schema") if isinstance(raw, dict) else None
+            return from_older(raw)
         if schema != SCHEMA:
             raise ConfigError(f"the config has schema {schema!r}; expected {SCHEMA}. The file comes from another version of "
                               "velap: read it with that one.")
-        return _build(Config, {name: value for name, value in raw.items() if name != "schema"}, "config")
+        return build(Config, {name: value for name, value in raw.items() if name != "schema"}, "config")
 
 
 def phase_to_dict(phase: Phase) -> dict[str, Any]:
@@ -89,7 +88,7 @@ def phase_to_dict(phase: Phase) -> dict[str, Any]:
     return {"phase": phase.name, **dataclasses.asdict(phase)}
 
 
-def _build(cls: type, raw: Any, where: str) -> Any:
+def build(cls: type, raw: Any, where: str) -> Any:
     """A dataclass from parsed JSON that names all of its fields and no other."""
     if not isinstance(raw, dict):
         raise ConfigError(f"`{where}` is {type(raw).__name__}; expected an object with the fields of {cls.__name__}.")
@@ -102,7 +101,7 @@ def _build(cls: type, raw: Any, where: str) -> Any:
     for name, hint in known.items():
         place = f"{where}.{name}"
         if dataclasses.is_dataclass(hint):
-            values[name] = _build(hint, raw[name], place)  # type: ignore[arg-type]
+            values[name] = build(hint, raw[name], place)  # type: ignore[arg-type]
         elif name == "phases":
             values[name] = tuple(_build_phase(each, f"{place}[{i}]") for i, each in enumerate(raw[name]))
         else:
@@ -115,14 +114,14 @@ def _build_phase(raw: Any, where: str) -> Phase:
     if kind not in PHASES:
         raise ConfigError(f"`{where}` is a phase of kind {kind!r}; expected one of {', '.join(PHASES)}. The file may come "
                           "from another version of velap.")
-    phase: Phase = _build(PHASES[kind], {name: value for name, value in raw.items() if name != "phase"}, where)
+    phase: Phase = build(PHASES[kind], {name: value for name, value in raw.items() if name != "phase"}, where)
     return phase
 
 
 def override(config: Config, **changes: Mapping[str, Any]) -> Config:
     """A copy with fields of its parts replaced: `override(config, planner={"n_iter": 10}, train={"joint": {"steps": 10}})`.
 
-    A phase is named by its label (`held` for an ensemble of held actions). One that the config lacks is put in its place
+    A phase is named by its label. One that the config lacks is put in its place
     when `steps` are given; `steps=0` leaves a phase out.
     """
     parts: dict[str, Any] = {}
@@ -132,21 +131,12 @@ def override(config: Config, **changes: Mapping[str, Any]) -> Config:
         current, given = getattr(config, part), dict(fields)
         if part == "train":
             phases = current.phases
-            for label in [name for name in given if name in LABELS]:
+            for label in [name for name in given if name in PHASES]:
                 phases = _with_phase(phases, label, given.pop(label))
             if phases != current.phases:
                 current = dataclasses.replace(current, phases=phases)
         parts[part] = replace(current, given, part)
     return dataclasses.replace(config, **parts)
-
-
-LABELS: dict[str, type[Phase]] = {
-    "encoder": PHASES["encoder"], "joint": PHASES["joint"], "latent": PHASES["latent"], "values": PHASES["values"],
-    "ensemble": PHASES["ensemble"], "held": PHASES["ensemble"], "clone": PHASES["clone"],
-}
-"""Kinds of phases by the label that settings use, in the order that a phase is put in."""
-HOLD = 5
-"""Steps of a held action where nothing else is said [steps]. ours."""
 
 
 def _with_phase(phases: tuple[Phase, ...], label: str, fields: Mapping[str, Any]) -> tuple[Phase, ...]:
@@ -162,8 +152,8 @@ def _with_phase(phases: tuple[Phase, ...], label: str, fields: Mapping[str, Any]
         raise ConfigError(f"the config has no phase {label!r}; expected one of "
                           f"{', '.join(phase.label for phase in phases)}. Add "
                           f"it with train.{label}.steps.")
-    made = LABELS[label](1, hold=HOLD) if label == "held" else LABELS[label](1)  # type: ignore[call-arg]
-    order = list(LABELS)
+    made = PHASES[label](1)
+    order = list(PHASES)
     before = tuple(phase for phase in others if order.index(phase.label) < order.index(label))
     return (*before, replace(made, fields, f"train.{label}"), *(phase for phase in others if phase not in before))
 
@@ -179,7 +169,7 @@ def describe(config: Config) -> Iterator[tuple[str, str, str, str]]:
                 yield f"{part}.{name}", type_name(hint), json.dumps(getattr(current, name)), meanings[name]
         if part == "train":
             made = {phase.label: phase for phase in current.phases}
-            for label, kind in LABELS.items():
+            for label, kind in PHASES.items():
                 meanings = docs(kind)
                 for name, hint in hints(kind).items():
                     value = json.dumps(getattr(made[label], name)) if label in made else "-"

@@ -143,22 +143,14 @@ class EnsemblePhase(Phase):
 
     members: int = 4
     """Policies. ours."""
-    hold: int = 1
-    """Steps that one action is held for [steps]. Above 1 the members teach a held policy beside π^g. ours: far from the goal
-    several steps tell directions apart better than one."""
     noise: float = 0.0
-    """Gaussian noise on the latents that members learn from, in deviations of each dimension. ours: φ mistakes places in
-    scenes that it has not seen."""
+    """Gaussian noise on the latents that members learn from, in errors of h after ten steps in each dimension. ours: what h
+    cannot predict is no ground to act on."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._at_least(1, "members", "hold")
+        self._at_least(1, "members")
         self._at_least(0, "noise")
-
-    @property
-    def label(self) -> str:
-        """`held` for the members of a held policy."""
-        return "held" if self.hold > 1 else self.name
 
     @property
     def updates(self) -> int:
@@ -179,14 +171,10 @@ class ClonePhase(Phase):
     candidates: int = 1
     """Policies that share the updates one after the other; the one that reaches the goal most often by h and Q^g is kept.
     ours: where a clone goes from states unlike the successes is luck."""
-    reach: int = 0
-    """Only the last steps before a success are cloned, this many; 0 clones whole episodes [steps]. ours: the way there is
-    often a random walk's."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._at_least(1, "candidates")
-        self._at_least(0, "reach")
 
 
 PHASES: dict[str, type[Phase]] = {
@@ -256,8 +244,3 @@ class TrainConfig:
     def clones(self) -> bool:
         """The model has a policy cloned from successes."""
         return any(isinstance(phase, ClonePhase) for phase in self.phases)
-
-    @property
-    def holds(self) -> bool:
-        """The model has a policy of held actions."""
-        return any(isinstance(phase, EnsemblePhase) and phase.hold > 1 for phase in self.phases)

@@ -154,18 +154,12 @@ class WindowSampler:
         appended = len(rows) + torch.arange(len(now_at), device=self.device)
         return torch.cat([rows, frames]), Later(appended, frames > rows[now_at + 1])
 
-    def successes(self, reach: int = 0) -> Tensor:
-        """Rows int64 [*] of the training transitions of successful episodes, with a `reach` above 0 of those at most so many
-        steps before a reward; raises DatasetError where there are none."""
+    def successes(self) -> Tensor:
+        """Rows int64 [*] of the training transitions of successful episodes; raises DatasetError where there are none."""
         if len(self.rewarded) == 0:
             raise DatasetError("the dataset has no successful episode to clone; expected at least one with a reward of 1. "
                                "Collect or label some successes, or leave the clone phase out (train.clone.steps=0).")
-        rows = self.transitions[torch.isin(self.first[self.transitions], self.first[self.rewarded])]
-        if reach == 0:
-            return rows
-        following = torch.searchsorted(self.rewarded, rows).clamp(max=len(self.rewarded) - 1)
-        ahead = self.rewarded[following] - rows
-        return rows[(ahead >= 0) & (ahead <= reach) & (self.first[self.rewarded[following]] == self.first[rows])]
+        return self.transitions[torch.isin(self.first[self.transitions], self.first[self.rewarded])]
 
     def _choose(self, positions: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """`count` of the positions without repetition, or all of them where they are no more or `count` is 0."""

@@ -74,8 +74,6 @@ class Player:
     model: LatentModel | None
     config: Config
     key: RunKey
-    legacy_hash: str | None = None
-    """What records of velap 0.1 call the key's `config_hash`."""
     make_env: Callable[[], gym.Env[Any, Any]]
     image_size: int
     """Side of the images that the agent takes [px]."""
@@ -137,7 +135,6 @@ def load_player(what: Evaluation) -> Player:
                  config_hash=method.config_hash(config, loaded.head, loaded.settings), checkpoint=loaded.digest,
                  code_version=code_version())
     return Player(agent=agent, model=model, config=config, key=key, image_size=size, reading=loaded.reading,
-                  legacy_hash=method.legacy_hash(config, loaded.head, loaded.settings),
                   make_env=lambda: make_env(env_id, what.env_kwargs))
 
 
@@ -245,7 +242,7 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
     if seeds[0] < 0:
         raise ConfigError(f"got the first episode seed {seeds[0]}; expected 0 or more. Test seeds are 0 to 99.")
     player = player or load_player(what)
-    with RecordFile(player.key.path(records), player.key, fresh, player.legacy_hash) as file:
+    with RecordFile(player.key.path(records), player.key, fresh) as file:
         for record in file.records:
             if record.episode_seed in seeds:
                 on_record(record)

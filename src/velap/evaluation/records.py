@@ -155,11 +155,9 @@ def _parse(path: Path, payload: bytes) -> tuple[list[Record], int]:
 class RecordFile:
     """The record file of one run, open for appending and locked against a second writer."""
 
-    def __init__(self, path: Path, key: RunKey, fresh: bool = False, legacy_hash: str | None = None) -> None:
-        """`legacy_hash` is what velap 0.1 called the key's `config_hash`: records of both belong together."""
+    def __init__(self, path: Path, key: RunKey, fresh: bool = False) -> None:
         self.path = path
         self.key = key
-        self._hashes = {key.config_hash, legacy_hash}
         with storage_errors(self.path), ExitStack() as opened:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             try:
@@ -179,13 +177,13 @@ class RecordFile:
         records, sound = _parse(self.path, self._stream.read())
         self._stream.truncate(sound)
         for record in records:
-            differing = [name for name in IDENTITY if getattr(record, name) != getattr(self.key, name)
-                         and not (name == "config_hash" and record.config_hash in self._hashes)]
+            differing = [name for name in IDENTITY if getattr(record, name) != getattr(self.key, name)]
             if differing:
                 name = differing[0]
                 raise RecordError(
                     f"{self.path} holds records of another run: `{name}` is {getattr(record, name)!r} there and "
-                    f"{getattr(self.key, name)!r} here. Give --fresh to move that file aside and start a new one.")
+                    f"{getattr(self.key, name)!r} here.{_another_way_to_act(name)} Give --fresh to move that file aside and "
+                    "start a new one.")
         return records
 
     @property
@@ -227,15 +225,18 @@ def _free_name(path: Path) -> Path:
     return path.with_name(f"{path.name}.old-{number}")
 
 
-def check_config(path: Path, config_hash: str, legacy_hash: str | None = None) -> None:
-    """Raises RecordError where a file already holds records of another config: better before a training than after it.
+def _another_way_to_act(name: str) -> str:
+    """What another `config_hash` may come from, besides another config."""
+    return (" Records of a version of velap whose configs had other fields count as another method's, which are not gone on "
+            "with." if name == "config_hash" else "")
 
-    `legacy_hash` is what velap 0.1 called the same config.
-    """
+
+def check_config(path: Path, config_hash: str) -> None:
+    """Raises RecordError where a file already holds records of another config: better before a training than after it."""
     found = {record.config_hash for record in read_records(path)} if path.exists() else {config_hash}
-    if found - {config_hash, legacy_hash}:
-        raise RecordError(f"{path} holds records of another config ({', '.join(sorted(found))}, now {config_hash}). Give "
-                          "--fresh to move that file aside, or other --records.")
+    if found - {config_hash}:
+        raise RecordError(f"{path} holds records of another config ({', '.join(sorted(found))}, now {config_hash})."
+                          f"{_another_way_to_act('config_hash')} Give --fresh to move that file aside, or other --records.")
 
 
 def read_all(root: Path) -> dict[Path, list[Record]]:

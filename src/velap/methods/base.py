@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from velap.config.migrate_v1 import legacy_json, legacy_shared_json
 from velap.errors import ConfigError, UnknownTaskError
 from velap.registry import METHODS
 
@@ -147,11 +146,6 @@ class Method(ABC):
     def config_hash(self, config: Config, head: Learnt | None = None, settings: Any = None) -> str:
         """The `config_hash` of its records, of everything that decides how it acts. `settings` None takes the preset's."""
         return self._hash_of(config.hash() if self.whole_checkpoint else config.shared_json(), config, head, settings)
-
-    def legacy_hash(self, config: Config, head: Learnt | None = None, settings: Any = None) -> str | None:
-        """The `config_hash` of its records by velap 0.1; None for a config that velap 0.1 could not have."""
-        text = legacy_json(config) if self.whole_checkpoint else legacy_shared_json(config)
-        return None if text is None else self._hash_of(text, config, head, settings)
 
     def _hash_of(self, text: str, config: Config, head: Learnt | None, settings: Any) -> str:
         """Hash of the config's part in `text`, and of settings and head."""

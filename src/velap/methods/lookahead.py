@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from velap.config.planning import ControllerConfig
-from velap.methods.leaders import simulate_held
 from velap.models.velap import LatentModel
 from velap.search.types import SearchFns
 
 LocalPolicy = Callable[[SearchFns, Tensor, Tensor, Sequence[torch.Generator]], Tensor]
-"""The model as the rows correct it, latents [P, D], waypoints [P, D], a generator a row → actions [P, A] in [-1, 1]."""
+"""The model, latents [P, D], waypoints [P, D], a generator a row → actions [P, A] in [-1, 1]."""
 SAMPLES = 32
 """S, actions drawn from g. ours."""
 
@@ -50,3 +49,11 @@ class Lookahead:
         ends = simulate_held(fns, latents, actions, self._count)
         q_min, _ = fns.reach(ends, waypoints.unsqueeze(1).expand_as(ends))
         return actions[torch.arange(len(actions), device=actions.device), q_min.argmax(1)]
+
+
+def simulate_held(fns: SearchFns, latents: Tensor, actions: Tensor, count: int) -> Tensor:
+    """Where `count` steps of each of `actions` [B, S, A] lead from latents [B, D]: [B, S, D]."""
+    ends = latents.unsqueeze(1).expand(-1, actions.shape[1], -1)
+    for _ in range(count):
+        ends = fns.step(ends, actions)
+    return ends

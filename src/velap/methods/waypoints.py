@@ -5,15 +5,10 @@ B environments, P rows, L waypoints of the longest plan held, D latent dimension
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from velap.search.types import SearchFns
-
-Rule = Callable[["Plans", SearchFns, Tensor], None]
-"""Moves rows on to later waypoints, given the model and their latents [B, D]."""
 
 
 class Plans:
@@ -52,31 +47,12 @@ class Plans:
             return self.waypoints.new_zeros(0, self.waypoints.shape[2])
         return self.waypoints[row, self.current[row] : self.length[row]].clone()
 
-
-def in_order(reached: float) -> Rule:
-    """`update_waypoint` of B.7: on to the next one while Q_min(z_curr, z_wp) > τ_wp = `reached`; the last one stays."""
-
-    def update(plans: Plans, fns: SearchFns, latents: Tensor) -> None:
-        rows = torch.nonzero(plans.current < plans.length - 1).flatten()
+    def advance(self, fns: SearchFns, latents: Tensor, reached: float) -> None:
+        """`update_waypoint` of B.7 for latents [B, D]: on to the next one while Q_min(z_curr, z_wp) > τ_wp = `reached`; the
+        last one stays."""
+        rows = torch.nonzero(self.current < self.length - 1).flatten()
         while len(rows):
-            q_min, _ = fns.reach(latents[rows], plans.targets(rows))
+            q_min, _ = fns.reach(latents[rows], self.targets(rows))
             rows = rows[q_min > reached]
-            plans.current[rows] += 1
-            rows = rows[plans.current[rows] < plans.length[rows] - 1]
-
-    return update
-
-
-def shortcut(near: float) -> Rule:
-    """On to the farthest waypoint ahead with Q_min(z_curr, z_wp) > `near`, where there is one (ours)."""
-
-    def update(plans: Plans, fns: SearchFns, latents: Tensor) -> None:
-        number = torch.arange(plans.waypoints.shape[1], device=latents.device)
-        ahead = (number > plans.current.unsqueeze(1)) & (number < plans.length.unsqueeze(1))
-        row, waypoint = ahead.nonzero(as_tuple=True)
-        if len(row) == 0:
-            return
-        q_min, _ = fns.reach(latents[row], plans.waypoints[row, waypoint])
-        plans.current.scatter_reduce_(0, row[q_min > near], waypoint[q_min > near], "amax")
-
-    return update
+            self.current[rows] += 1
+            rows = rows[self.current[rows] < self.length[rows] - 1]

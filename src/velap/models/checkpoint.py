@@ -31,6 +31,8 @@ SHARED = ("encoder.", "command_weight", "action_", "dynamics.", "global_policy."
 bounds."""
 YOUNGER = ("missed", "bank_gap")
 """Tensors that the first files lack."""
+FORMER = "held_policy."
+"""Beginning of the names of tensors that older files have and today's models do not."""
 HALF_ABOVE = 3_000_000
 """Weights larger than this are stored in half precision, which keeps a released file below it [bytes]. ours."""
 
@@ -44,7 +46,7 @@ def shared_weights(metadata: Mapping[str, str]) -> str:
 def make_model(config: Config, spaces: Spaces) -> LatentModel:
     """The model of a config with fresh weights."""
     train = config.train
-    return LatentModel(config.model, spaces, train.discount, clones=train.clones, holds=train.holds)
+    return LatentModel(config.model, spaces, train.discount, clones=train.clones)
 
 
 def save_checkpoint(path: Path, model: LatentModel, config: Config, provenance: Mapping[str, str]) -> str:
@@ -118,7 +120,8 @@ def save_folder(model: LatentModel, folder: Path, config: Config | None) -> Path
 def restore(module: nn.Module, tensors: Mapping[str, Tensor], path: Path | str) -> None:
     """Load weights into a module built from the file's own config; raises CheckpointError where names or shapes differ."""
     expected = module.state_dict()
-    tensors = {**{name: expected[name] for name in YOUNGER if name in expected}, **tensors}
+    tensors = {**{name: expected[name] for name in YOUNGER if name in expected},
+               **{name: value for name, value in tensors.items() if not name.startswith(FORMER)}}
     wrong = sorted(
         name
         for name in expected.keys() | tensors.keys()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from velap.config.planning import NEIGHBOUR_DISTANCE, Precision
+from velap.config.planning import NEIGHBOUR_DISTANCE, SNAP_GAP, Precision
 from velap.errors import VelapError
 from velap.models.functions import SearchFns
 from velap.models.inference import joined, nearest_row
@@ -62,6 +62,7 @@ def search_fns(model: LatentModel, hidden: Precision | None = None) -> SearchFns
         d_neigh=NEIGHBOUR_DISTANCE * step_distance,
         step_distance=step_distance,
         project=_project(model) if model.config.bank_size else None,
+        snaps=float(model.bank_gap) < SNAP_GAP,
         act_success=None if cloned is None else lambda latent: cloned(latent).tanh_(),
         rollout=_rollout(model),
     )

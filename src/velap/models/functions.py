@@ -36,6 +36,8 @@ class SearchFns(NamedTuple):
     """Upper 5-percentile of the distances between subsequent encodings [latent distance]."""
     project: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None
     """Latents [*, D] → nearest dataset latent [*, D] and its distance [*]; None where the model keeps no bank."""
+    snaps: bool = False
+    """Anchors of the search move its candidates to `project` where its config leaves that to the model (ours)."""
     act_success: Callable[[Tensor], Tensor] | None = None
     """The policy cloned from successes: latents [*, D] → actions [*, A] in [-1, 1]; None where the model has none (ours)."""
     rollout: Callable[[Tensor, Tensor | None, int], Tensor] | None = None

@@ -51,13 +51,12 @@ class Origin(NamedTuple):
 
 
 class LatentModel(nn.Module):
-    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1; on demand a policy cloned from successes and one of held actions (ours).
+    """φ, h, g, π^l, Q^l × n, π^g, Q^g of Eq. 1; on demand a policy cloned from successes (ours).
 
     Actions are in [-1, 1] inside; `to_env` and `to_unit` convert.
     """
 
-    def __init__(self, config: ModelConfig, spaces: Spaces, discount: float, *, clones: bool = False,
-                 holds: bool = False) -> None:
+    def __init__(self, config: ModelConfig, spaces: Spaces, discount: float, *, clones: bool = False) -> None:
         super().__init__()
         self.config, self.spaces, self.discount = config, spaces, discount
         self.origin: Origin | None = None
@@ -72,7 +71,6 @@ class LatentModel(nn.Module):
         self.local_critics = EnsembleMLP(N_ENS, 2 * latent + action, CRITIC, norm)
         self.global_critic = EnsembleMLP(config.n_global, latent + action, CRITIC, norm)
         self.success_policy = Policy(latent, POLICY, action, norm) if clones else None
-        self.held_policy = Policy(latent, POLICY, action, norm) if holds else None
         if config.critic_bounded:
             for critic in (self.local_critics, self.global_critic):
                 nn.init.constant_(critic.biases[-1], UNREWARDED)
@@ -171,8 +169,7 @@ class LatentModel(nn.Module):
         """New weights for everything but φ; the parameters stay in their memory."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            new = LatentModel(self.config, self.spaces, self.discount, clones=self.success_policy is not None,
-                              holds=self.held_policy is not None)
+            new = LatentModel(self.config, self.spaces, self.discount, clones=self.success_policy is not None)
         new.encoder.load_state_dict(self.encoder.state_dict())
         self.load_state_dict(new.state_dict())
 

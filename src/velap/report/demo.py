@@ -13,7 +13,7 @@ from velap.evaluation.evaluate import Evaluation, Player, load_player, to_record
 from velap.evaluation.records import Record
 from velap.evaluation.rollout import Moment
 from velap.evaluation.summary import Summary, summarise, summary_text
-from velap.methods.velap import VelapAgent
+from velap.methods.tree_agent import TreeAgent
 from velap.models.checkpoint import released_checkpoint
 from velap.report.figures import LatentMap, plan_figure
 from velap.report.video import VideoRecorder, latent_map_of, picture
@@ -34,7 +34,7 @@ class FirstPlan:
         """Keep the plan once, as soon as it is there."""
         agent = moment.agent
         wanted = self._kept is None and moment.seed == self._seed
-        if wanted and isinstance(agent, VelapAgent) and isinstance(agent.last_plan, Plan):
+        if wanted and isinstance(agent, TreeAgent) and isinstance(agent.last_plan, Plan):
             rows = np.flatnonzero(agent.last_plan_rows == moment.row)
             if len(rows):
                 self._kept = picture(moment, PICTURE), agent.last_plan, int(rows[0])

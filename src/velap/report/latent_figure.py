@@ -23,11 +23,11 @@ from velap.data.sampling import WindowSampler
 from velap.envs.protocol import Mapped
 from velap.errors import DatasetError
 from velap.evaluation.evaluate import Evaluation, load_player, make_env
+from velap.methods.provenance import search_of
 from velap.methods.states import StateEncoder
 from velap.models.checkpoint import load_checkpoint, released_checkpoint
 from velap.report.figures import PROBES, draw_path, draw_tree, embed, new_figure, probe, save_figure, value_colours
 from velap.runs import write_atomic
-from velap.search.est import plan
 from velap.tasks import TASKS
 from velap.training.encoding import encode_rows
 from velap.training.loop import pick_device
@@ -132,7 +132,7 @@ def _space(model: LatentModel, config: Config, title: str, latents: NDArray[np.f
     """Plan from the roots [R, D], and put states, trees and paths into one plane."""
     generators = [torch.Generator().manual_seed(FIRST_SEED + row) for row in range(len(roots))]
     with torch.inference_mode():
-        found = plan(model.search_fns(), roots, config.planner, generators)
+        found = search_of(model, config)(roots, generators)
     size, lengths = int(found.tree.size[0]), found.length.tolist()
     waypoints = [found.waypoints[row, :length].float().cpu().numpy() for row, length in enumerate(lengths)]
     plane, tree, *paths = embed(latents, found.tree.latents[0, :size].float().cpu().numpy(), *waypoints)

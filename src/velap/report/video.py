@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from velap.methods.velap import VelapAgent
+from velap.methods.tree_agent import FOLLOWING, IN_WORDS, TreeAgent
 from velap.report.figures import LatentMap, can_probe, probe, to_pixels
 from velap.runs import storage_errors
 
@@ -77,7 +77,7 @@ class VideoRecorder:
             self._steps[row] = 0
         else:
             self._steps[row] += 1
-            if isinstance(moment.agent, VelapAgent):
+            if isinstance(moment.agent, TreeAgent):
                 text += self._draw_plan(image, moment.agent, row)
         caption = Image.new("RGB", (TILE, CAPTION), "white")
         ImageDraw.Draw(caption).text((6, 1), text, colour, font=self._font, spacing=2)
@@ -85,14 +85,13 @@ class VideoRecorder:
         self._canvas[y : y + TILE, x : x + TILE] = np.asarray(image)
         self._canvas[y + TILE : y + TILE + CAPTION, x : x + TILE] = np.asarray(caption)
 
-    def _draw_plan(self, image: Image.Image, agent: VelapAgent, row: int) -> str:
+    def _draw_plan(self, image: Image.Image, agent: TreeAgent, row: int) -> str:
         """Draw the waypoints ahead of `row`, the next one in red; returns what the agent does, for the caption."""
         value = agent.last_values[row]
         waypoints = agent.plans.ahead(row).float().cpu().numpy()
-        if agent.led[row]:
-            return f"Q^g {value:.3f}, successes followed"
-        if agent.near_goal[row] or len(waypoints) == 0:
-            return f"Q^g {value:.3f}, {agent.global_policy} acts"
+        actor = agent.last_actors[row]
+        if actor not in FOLLOWING:
+            return f"Q^g {value:.3f}, {IN_WORDS[actor]}"
         if self._map is not None:
             points = [tuple(point) for point in to_pixels(self._map.locate(waypoints), self._map.extent, TILE)]
             draw = ImageDraw.Draw(image)
@@ -100,7 +99,7 @@ class VideoRecorder:
             for point in points[:0:-1]:
                 draw.circle(point, 3, _WAYPOINT)
             draw.circle(points[0], 4, _NEXT)
-        return f"Q^g {value:.3f}, {len(waypoints)} waypoints ahead"
+        return f"Q^g {value:.3f}, {len(waypoints)} ahead, {IN_WORDS[actor]}"
 
     def _write(self) -> None:
         with storage_errors(self.path):

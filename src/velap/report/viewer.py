@@ -18,7 +18,7 @@ from velap.errors import CheckpointError, ConfigError, UnknownTaskError
 from velap.evaluation.evaluate import Evaluation, Player, load_player
 from velap.evaluation.records import Record, read_records
 from velap.evaluation.rollout import Episode, Moment
-from velap.methods.velap import VelapAgent
+from velap.methods.tree_agent import FOLLOWING, Actor, TreeAgent
 from velap.report.demo import released_checkpoint
 from velap.report.diagnose.model import open_recorded, real_states_of
 from velap.report.figures import can_probe, probe
@@ -32,9 +32,6 @@ SIDE = 256
 """Side of the pictures of the world [px]."""
 STATES = 1200
 """P at most. ours: enough to see a maze's corridors, and some seconds of Isomap."""
-
-GOAL, PLAN, LEADER, NOWHERE = "goal", "plan", "leader", "nowhere"
-"""Who acts in a step: π^g near the goal, π^l along a plan, a leader, or π^g where the plan leads nowhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +68,8 @@ class Step:
     """[D]; None for methods that do not tell."""
     value: float | None
     """Q^g [Q-value]."""
-    actor: str | None
-    """One of GOAL, PLAN, LEADER, NOWHERE."""
+    actor: Actor | None
+    """Who acts; None for methods that do not tell."""
     waypoint: int | None
     """Number of the waypoint headed for, from 1 on; None where no plan is followed."""
     plan: int | None
@@ -106,22 +103,21 @@ class Tracer:
             self.traces.append(Trace(outcome=moment.outcome, steps=tuple(self._steps), last_picture=seen,
                                      plans=tuple(self._plans)))
             self._steps, self._plans = [], []
-        elif isinstance(moment.agent, VelapAgent):
+        elif isinstance(moment.agent, TreeAgent):
             self._steps.append(self._step_of(moment.agent, moment.row, seen))
         else:
             self._steps.append(Step(picture=seen, latent=None, value=None, actor=None, waypoint=None, plan=None))
 
-    def _step_of(self, agent: VelapAgent, row: int, seen: NDArray[np.uint8]) -> Step:
+    def _step_of(self, agent: TreeAgent, row: int, seen: NDArray[np.uint8]) -> Step:
         if row in agent.planned_rows:
             self._plans.append(_planned(agent, row, len(self._steps)))
-        follows = int(agent.plans.length[row]) > 1
-        actor = LEADER if agent.led[row] else GOAL if agent.near_goal[row] else PLAN if follows else NOWHERE
+        actor = agent.last_actors[row]
         return Step(picture=seen, latent=agent.last_latents[row], value=float(agent.last_values[row]), actor=actor,
-                    waypoint=int(agent.plans.current[row]) if actor == PLAN else None,
+                    waypoint=int(agent.plans.current[row]) if actor in FOLLOWING else None,
                     plan=len(self._plans) - 1 if self._plans else None)
 
 
-def _planned(agent: VelapAgent, row: int, step: int) -> Planned:
+def _planned(agent: TreeAgent, row: int, step: int) -> Planned:
     """The plan that the agent has just made for `row`."""
     plan, place = agent.last_plan, int(np.flatnonzero(agent.last_plan_rows == row)[0])
     assert plan is not None

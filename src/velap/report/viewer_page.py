@@ -21,6 +21,7 @@ from sklearn.manifold import Isomap
 
 from velap.errors import ConfigError
 from velap.evaluation.records import Record
+from velap.methods.tree_agent import IN_WORDS
 from velap.models.horizon import q_from_steps
 from velap.report.figures import NEIGHBOURS
 from velap.report.viewer import SIDE, Backdrop, Planned, Subject, Trace
@@ -69,7 +70,7 @@ def episode_data(subject: Subject, trace: Trace, backdrop: Backdrop | None, proj
         "actors": [step.actor for step in trace.steps],
         "waypoints": [step.waypoint for step in trace.steps],
         "plan_of": [step.plan for step in trace.steps],
-        "global_policy": getattr(player.agent, "global_policy", "π^g"),
+        "in_words": IN_WORDS,
         "stop_value": None if discount is None else q_from_steps(config.controller.stop_exponent, discount),
         "discount": discount,
         "trail": flat.trail,

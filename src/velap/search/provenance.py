@@ -20,31 +20,27 @@ from torch.nn import functional as F
 
 from velap.config.planning import PlannerConfig
 from velap.models.horizon import steps_from_q
-from velap.search.est import Thresholds, thresholds
+from velap.search.est import Thresholds, Verdict, count_rejections, thresholds
 from velap.search.neighbours import candidate_neighbours, first_come, gained_neighbours, incoming_q
 from velap.search.risk import Policy, Risk
 from velap.search.sampling import Noise, draw_noise, node_distribution, sample_nodes
 from velap.search.simulation import anchored, simulate, value_where
 from velap.search.tree import Candidates, free_slots, insert_, new_tree, take, trace_back, trimmed
-from velap.search.types import Path, RowGenerator, SearchFns, Tree
+from velap.search.types import Plan, RowGenerator, SearchFns
 
 TRUNK_STEPS = 150
 """Longest walk of a policy from the root before the first round [steps]. ours: the longest episode that most tasks allow."""
 
 
 @dataclass(frozen=True)
-class Provenance(Path):
-    """A path whose edges tell their proposer, and the tree it was found in."""
+class Provenance(Plan):
+    """A path whose edges tell their proposer. Its `cost` counts steps and risk; candidates of the policies count among
+    its `rejections`, their walks from the root do not."""
 
     proposers: Tensor
     """[B, L] int64 proposer of the edge into each node; 0 for the root."""
     steps_to_goal: Tensor
     """[B, L] log_γ Q^g of each node [steps]."""
-    reached_goal: Tensor
-    """[B] bool: some node has Q^g > τ_goal."""
-    nodes: Tensor
-    """[B, L] int64 slots of the waypoints in the tree."""
-    tree: Tree
 
 
 class _Growing:
@@ -95,14 +91,17 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
     for number, policy in enumerate(policies, 1):
         _walk_from_root(grown, fns, cfg, limits, policy, number, edges, risk)
     rounds = range(0, cfg.n_iter, cfg.candidates)
+    verdicts = []
     for start in rounds:
-        _expand(grown, fns, cfg, limits, noise.part(start, start + cfg.candidates), policies, risk)
+        part = noise.part(start, start + cfg.candidates)
+        verdicts.append(_expand(grown, fns, cfg, limits, part, policies, risk))
     leaf, reached = _choose_leaf(grown, limits.goal)
     nodes, length = trace_back(grown.tree.parents, leaf, depth=edges + len(rounds))
     nodes = nodes[:, : int(length.max())]
-    return Provenance(waypoints=take(grown.tree.latents, nodes), length=length, proposers=grown.proposers.gather(1, nodes),
-                      steps_to_goal=grown.steps_to_goal.gather(1, nodes), reached_goal=reached, nodes=nodes,
-                      tree=trimmed(grown.tree))
+    cost = (grown.tree.root_steps + grown.risk).gather(1, leaf.unsqueeze(1)).squeeze(1)
+    return Provenance(waypoints=take(grown.tree.latents, nodes), length=length, cost=cost, reached_goal=reached, nodes=nodes,
+                      tree=trimmed(grown.tree), rejections=count_rejections(verdicts, limits),
+                      proposers=grown.proposers.gather(1, nodes), steps_to_goal=grown.steps_to_goal.gather(1, nodes))
 
 
 def _walk_from_root(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, policy: Policy, number: int,
@@ -138,7 +137,7 @@ def _walk(fns: SearchFns, z: Tensor, policy: Policy, n_sim: int) -> Tensor:
 
 
 def _expand(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, noise: Noise,
-            policies: Sequence[Policy], risk: Risk) -> None:
+            policies: Sequence[Policy], risk: Risk) -> Verdict:
     """One round of K candidates: half by the policies, from the nodes that promise most, half by g as in Algorithm 1."""
     tree, discount = grown.tree, fns.discount
     count = noise.node.shape[1]
@@ -169,16 +168,17 @@ def _expand(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresho
 
     # The paths of Eq. 8 in steps: an edge of a policy has n_sim of them.
     steps = torch.where(by_policy, torch.full_like(q_edge, cfg.n_sim), steps_from_q(q_edge, discount))
-    risked = torch.where(by_policy, risk.of_policy(proposers, grown.steps_to_goal.gather(1, parents)).to(q_edge), risk.of_model)
+    of_policies = risk.of_policy(proposers, grown.steps_to_goal.gather(1, parents)).to(q_edge)
+    risked = torch.where(by_policy, of_policies, risk.of_model)
 
     # l. 14. A node is too close to nodes that are no dearer: a better way to the same place is novel.
     near = candidate_neighbours(tree.latents[:, :slots], used, z_new, fns.d_neigh)
     q_in = incoming_q(fns, near, z_new, feasible, parents, q_edge)
     cost = tree.root_steps + grown.risk
-    own = cost.gather(1, parents) + steps + risked
-    others = torch.cat([cost[:, :slots], own], 1).gather(1, near.rows.flatten(1)).view_as(near.rows)
+    new_cost = cost.gather(1, parents) + steps + risked
+    others = torch.cat([cost[:, :slots], new_cost], 1).gather(1, near.rows.flatten(1)).view_as(near.rows)
     from_parent = near.rows == parents.unsqueeze(-1)
-    too_close = ~(q_in < limits.high) & ((others < own.unsqueeze(-1) + cfg.n_sim) | from_parent)
+    too_close = ~(q_in < limits.high) & ((others < new_cost.unsqueeze(-1) + cfg.n_sim) | from_parent)
     novel = feasible & ~too_close[:, :, :-count].any(-1)
     accepted = first_come(novel, too_close[:, :, -count:])
 
@@ -189,6 +189,8 @@ def _expand(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresho
     new = Candidates(z_new, parents, value_where(fns, z_new, accepted), tree.root_steps.gather(1, parents) + steps,
                      gained[:, slots:])
     grown.insert(new, accepted, proposers.clamp(min=0), risked)
+    idle = proposers < 0  # nothing was left to walk from: no candidate, which counts as no rejection
+    return Verdict(accepted | idle, supported | idle, q_edge.masked_fill(idle, 1), std_edge.masked_fill(by_policy | idle, 0))
 
 
 def _policy_parents(grown: _Growing, used: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -58,7 +58,7 @@ def _simulate_packed(fns: SearchFns, z: Tensor, noise: Tensor, by_policy: Tensor
 
 def anchored(fns: SearchFns, z: Tensor, cfg: PlannerConfig) -> tuple[Tensor, Tensor]:
     """Candidates [B, K, D] after anchoring to the dataset's latents, and which of them [B, K] bool are supported (ours)."""
-    if cfg.anchor == "none":
+    if cfg.anchor == "none" or (cfg.anchor == "auto" and not fns.snaps):
         return z, torch.ones(z.shape[:-1], dtype=torch.bool, device=z.device)
     if fns.project is None:
         raise ConfigError(f"config field `anchor` is {cfg.anchor!r}, but the model keeps no dataset latents; "

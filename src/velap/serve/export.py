@@ -64,7 +64,6 @@ FUNCTIONS = (
     _Function("act_global", "global_policy", (LATENT,), ACTION),
     _Function("act_local", "local_policy", (LATENT, GOAL), ACTION),
     _Function("success_policy", "success_policy", (LATENT,), ACTION),
-    _Function("held_policy", "held_policy", (LATENT,), ACTION),
 )
 """φ, π^g, π^l, and the policies that not every config has."""
 

@@ -50,7 +50,7 @@ def fresh(policy: nn.Module, generator: torch.Generator) -> None:
 @torch.no_grad()
 def arrival_rate(model: LatentModel, policy: nn.Module, states: Tensor) -> float:
     """Share of the states [*, D] in the half farther from the goal from where a cloned policy gets there by h, averaged over
-    the gains that the controller tries: that tells good clones apart better than the best gain alone."""
+    gains on its actions: that tells good clones apart better than its own gain alone."""
     values = model.value(states)
     far = states[values <= values.median()]
     goal_value = q_from_steps(GOAL_EXPONENT, model.discount)
@@ -83,7 +83,7 @@ class CloneLearner(PhaseLearner[ClonePhase]):
         policy = run.model.success_policy
         assert policy is not None, "a clone phase gives the model a policy of successes"
         self.policy, self.latents = policy, frozen.latents
-        self.rows = run.sampler.successes(phase.reach)
+        self.rows = run.sampler.successes()
         """int64 [*], transitions that are cloned."""
         self.best = Best(policy)
         self.modules = {"best": self.best}
@@ -94,7 +94,7 @@ class CloneLearner(PhaseLearner[ClonePhase]):
     @classmethod
     def check(cls, phase: ClonePhase, sampler: WindowSampler) -> None:
         """Raises DatasetError where no episode succeeds."""
-        sampler.successes(phase.reach)
+        sampler.successes()
 
     def begin(self) -> None:
         """Random numbers of its own."""

@@ -4,24 +4,17 @@ Where a policy goes from a state that the data hardly hold is an accident of its
 meets such states. What several policies agree on is no accident; the median of their actions is taught to one policy of the
 model, so that nothing acts slower.
 
-With held actions (after action chunks as in Q-chunking, arXiv 2507.07969) a transition is several steps long. One action
-changes Q by a few hundredths of itself, less than a critic errs, and the sign of that change is all that a policy learns
-from. Several steps in one direction change it several times as much, and where the data's actions are coherent the mean of
-the next few says what was done. Near contacts it says too little: other policies have to act there.
-
 E members, B transitions of each, F frames, D latent, A action dimension.
 """
 
 from __future__ import annotations
 
 import copy
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from velap.config import EnsemblePhase
-from velap.data.sampling import WindowSampler
 from velap.losses import Info, cloning_error, critic_loss, global_critic_loss, policy_loss, polyak
 from velap.models.networks import CRITIC, POLICY, EnsembleMLP
 from velap.models.velap import UNREWARDED
@@ -32,41 +25,8 @@ from velap.training.steps import cosine
 
 BATCH = 512
 """Transitions a batch of each member. ours."""
-HELD_STREAM = 8
-"""Random numbers of held members, so that they can be learnt again beside the same model."""
 CLOSE = 1e-4
 """Squared distance of actions, averaged over A, within which the distance has no edge."""
-
-
-class HeldTransitions(NamedTuple):
-    """Every row of the data as a transition of several steps, fewer before the end of an episode."""
-
-    actions: Tensor
-    """float32 [F, A], mean action of those steps in [-1, 1]."""
-    rewards: Tensor
-    """float32 [F], discounted sum of their rewards."""
-    alive: Tensor
-    """float32 [F], bootstrap weight γ^(n-1), 0 at terminals; the caller multiplies by γ."""
-    following: Tensor
-    """int64 [F], the row after those steps."""
-
-
-def held_transitions(sampler: WindowSampler, steps: int, discount: float) -> HeldTransitions:
-    """Every row's transition of `steps` steps; with 1 they are those of the data. The last row of an episode, which no
-    transition starts from, stands for itself."""
-    at = torch.arange(len(sampler.actions), device=sampler.device)
-    actions, rewards = torch.zeros_like(sampler.actions), torch.zeros_like(sampler.rewards)
-    count, alive = torch.zeros_like(rewards), torch.ones_like(rewards)
-    for _ in range(steps):
-        inside = at < sampler.last
-        going = inside & (alive > 0)
-        actions += torch.where(going[:, None], sampler.actions[at], 0.0)
-        rewards += torch.where(going, discount**count * sampler.rewards[at], 0.0)
-        count += going
-        alive = torch.where(going & sampler.terminated[at], 0.0, alive)
-        at = torch.where(inside, at + 1, at)
-    taken = count.clamp(min=1)
-    return HeldTransitions(actions / taken[:, None], rewards, alive * discount ** (taken - 1), at)
 
 
 HORIZON = 10
@@ -98,11 +58,10 @@ class EnsembleLearner(PhaseLearner[EnsemblePhase]):
     def __init__(self, phase: EnsemblePhase, run: Run, frozen: Frozen) -> None:
         super().__init__(phase, run)
         model, shape, action = run.model, run.model.config, run.model.action_dim
-        self.latents, self.held = frozen.latents, phase.hold > 1
-        self.data = held_transitions(run.sampler, phase.hold, run.config.discount)
+        self.latents = frozen.latents
         latent = self.latents.shape[1]
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(run.weight_seed + (3 if self.held else 2))
+            torch.manual_seed(run.weight_seed + 2)
             self.policies = EnsembleMLP(phase.members, latent, POLICY, shape.norm, action)
             self.critics = EnsembleMLP(phase.members * shape.n_global, latent + action, CRITIC, shape.norm)
         if shape.critic_bounded:
@@ -111,30 +70,20 @@ class EnsembleLearner(PhaseLearner[EnsemblePhase]):
         self.modules = {"policies": self.policies, "critics": self.critics, "target": self.target}
         for module in self.modules.values():
             module.to(run.sampler.device)
-        taught = model.held_policy if self.held else model.global_policy
-        assert taught is not None, "a phase of held actions gives the model a held policy"
-        self.taught = taught
-        """The policy that they teach."""
-        values = [] if self.held else [*model.global_critic.parameters()]
         learnt = {"critics": [*self.critics.parameters()], "policies": [*self.policies.parameters()],
-                  "taught": [*taught.parameters(), *values]}
+                  "taught": [*model.global_policy.parameters(), *model.global_critic.parameters()]}
         self.optimizers = {name: adam(parameters, FROZEN_RATE) for name, parameters in learnt.items()}
         self.deviation = model_errors(run, self.latents)
         """float32 [D], what h errs by in each dimension."""
 
-    def begin(self) -> None:
-        """Held members have random numbers of their own."""
-        if self.held:
-            self.run.fresh_stream(HELD_STREAM)
-
     def update(self, done: int) -> Info:
-        """One update of the members, or after those of what they teach. Policies of held members learn in every update."""
+        """One update of the members, or after those of what they teach."""
         steps = self.phase.steps
         if done >= steps:
             self.set_rate(FROZEN_RATE * cosine((done - steps) / (self.phase.updates - steps)))
             return self.captured("distil", self._distil)
         self.set_rate(FROZEN_RATE * cosine(done / steps))
-        return self.captured("members", lambda: self._learn(True)) if self.held else self.in_turn(self._learn)
+        return self.in_turn(self._learn)
 
     def _learn(self, policies: bool) -> Info:
         rows = self.draw(self.phase.members)
@@ -185,15 +134,16 @@ class EnsembleLearner(PhaseLearner[EnsemblePhase]):
 
     def value_loss(self, rows: Tensor, noise: Tensor | float = 0.0) -> tuple[Tensor, Info]:
         """Eq. 4 of every member. rows int64 [E, B], noise [E, B, D]."""
-        data, config, weight = self.data, self.run.config, torch.ones(rows.shape[1], device=rows.device)
+        data, config, weight = self.run.sampler, self.run.config, torch.ones(rows.shape[1], device=rows.device)
         with torch.no_grad():
-            then = self.latents[data.following[rows]] + noise
+            then = self.latents[rows + 1] + noise
             next_q = self.qs(self.target, then, self.act(then)).amin(1, keepdim=True)
         q = self.qs(self.critics, self.latents[rows] + noise, data.actions[rows])
+        alive = (~data.terminated[rows]).float()
         loss, info = global_critic_loss(
-            q, data.rewards[rows].unsqueeze(1), data.alive[rows].unsqueeze(1), next_q, weight, discount=config.discount,
+            q, data.rewards[rows].unsqueeze(1), alive.unsqueeze(1), next_q, weight, discount=config.discount,
             kind=config.critic_loss, floor=config.critic_floor)
-        return loss, {f"{self.phase.label}/loss": info["loss"], f"{self.phase.label}/q": info["q"]}
+        return loss, {"ensemble/loss": info["loss"], "ensemble/q": info["q"]}
 
     def acting_loss(self, rows: Tensor, noise: Tensor | float = 0.0) -> tuple[Tensor, Info]:
         """Eq. 5 of every member. rows int64 [E, B], noise [E, B, D]."""
@@ -201,25 +151,23 @@ class EnsembleLearner(PhaseLearner[EnsemblePhase]):
         latents = self.latents[rows] + noise
         action = self.act(latents)
         q = self.qs(self.critics, latents, action).amin(1)
-        loss, info = policy_loss(q, action, self.data.actions[rows], config.c3, weight,
+        loss, info = policy_loss(q, action, self.run.sampler.actions[rows], config.c3, weight,
                                  relative=config.critic_loss == "cross_entropy")
-        return loss, {f"{self.phase.label}/policy": info["loss"], f"{self.phase.label}/imitation": info["imitation"]}
+        return loss, {"ensemble/policy": info["loss"], "ensemble/imitation": info["imitation"]}
 
     def distil_loss(self, rows: Tensor) -> tuple[Tensor, Info]:
-        """The taught policy against the members' actions, by distance, not by its square: it learns their median, and one
+        """π^g against the members' actions, by distance, not by its square: it learns their median, and one
         that stands alone is not heard. π^g's critic learns the mean of their minima, at the data's and at π^g's own actions.
 
         rows int64 [B].
         """
         model, config, latents, count = self.run.model, self.run.config, self.latents[rows], self.phase.members
-        action = self.taught(latents)
+        action = model.global_policy(latents)
         at = torch.cat([self.run.sampler.actions[rows], action.detach()])
         with torch.no_grad():
             every = latents.expand(count, -1, -1)
             actions = self.act(every)
         acting = (cloning_error(action, actions) + CLOSE).sqrt().mean()
-        if self.held:
-            return acting, {"held/distil": acting.detach()}
         with torch.no_grad():
             value = self.qs(self.critics, every.repeat(1, 2, 1), at.expand(count, -1, -1)).amin(1).mean(0)
         values, _ = critic_loss(model.global_qs(latents.repeat(2, 1), at), value, torch.ones_like(value),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from velap.envs.protocol import Measured, Positioned, WithObjects, WithSubtasks
 from velap.evaluation.evaluate import BATCH, Player
 from velap.evaluation.rollout import Moment
-from velap.methods.velap import VelapAgent
+from velap.methods.tree_agent import TreeAgent
 from velap.report.diagnose.plans import FilmStrip
 
 LEFT_START = 5.0
@@ -174,7 +174,7 @@ class Tracer:
         if outcome is not None:
             trace.success, trace.steps = outcome.success, outcome.steps
         else:
-            assert isinstance(agent, VelapAgent)
+            assert isinstance(agent, TreeAgent)
             trace.values.append(float(agent.last_values[moment.row]))
             trace.near_goal.append(bool(agent.near_goal[moment.row]))
         step = len(trace.values) if outcome is not None else len(trace.values) - 1

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from velap.config import Config
+from velap.methods.provenance import search_of
 from velap.models.horizon import q_from_steps
 from velap.models.velap import LatentModel
 from velap.report.diagnose.model import RealStates
-from velap.search.est import plan
 from velap.search.types import Plan
 
 
@@ -86,8 +86,7 @@ def grow(model: LatentModel, config: Config, starts: Starts, seeds: Sequence[int
     device = next(model.parameters()).device
     with torch.inference_mode():
         latents = model.encode(torch.from_numpy(starts.stacks).to(device)).float()
-    fns = model.search_fns()
-    return latents, plan(fns, latents, config.planner, [torch.Generator().manual_seed(seed) for seed in seeds])
+    return latents, search_of(model, config)(latents, [torch.Generator().manual_seed(seed) for seed in seeds])
 
 
 def tree_numbers(starts: Starts, result: Plan, real_states: RealStates, one_step: float) -> tuple[TreeNumbers, ...]:
