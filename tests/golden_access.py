@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from velap.config.migrate_v1 import legacy_json, to_v1
 
 from velap import api
 from velap.config import Config, ModelConfig, legacy_hash, override
-from velap.config.migrate_v1 import legacy_json, to_v1
 from velap.data.frames import FrameStore
 from velap.data.sampling import WholeWindows
 from velap.errors import CheckpointError

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from toy_env import ACTION_SCALE, SIDE, ToyEnv, ToyModel, draw, toy_config
-from toy_world import GOAL, SPEED, START, TIP
+from toy_world import START
 from velap.config import override
 from velap.errors import ConfigError
 from velap.methods.base import make_agent
@@ -103,19 +103,6 @@ def test_waypoints_are_passed_when_reached_several_at_once() -> None:
     assert agent.plans.ahead(0).tolist() == [[-4.0, 9.0]], "the last waypoint stays"
 
 
-def test_a_shortcut_leads_to_the_farthest_waypoint_in_reach() -> None:
-    agent = VelapAgent(ToyModel(), override(toy_config(n_iter=20), controller={"shortcut_exponent": 6.0}))
-    agent.reset(np.ones(1, bool), np.array([0]))
-    agent.act(frames_at(START))
-    with torch.inference_mode():
-        # from (-6, 0): 9 steps to the first waypoint, 4 to the second, 5 to the third, 7 to the last
-        set_plan(agent, [START, (-6.0, 9.0), (-6.0, 4.0), (-1.0, 0.0), (1.0, 0.0)])
-    agent.act(frames_at((-6.0, 0.0)))
-    assert agent.plans.ahead(0).tolist() == [[-1.0, 0.0], [1.0, 0.0]]
-    agent.act(frames_at((-6.0, -9.0)))
-    assert agent.plans.ahead(0).tolist() == [[-1.0, 0.0], [1.0, 0.0]], "nothing in reach: no way back either"
-
-
 @pytest.mark.parametrize(("lookahead", "gets_there"), [(0, False), (3, True)])
 def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: int, gets_there: bool) -> None:
     model = ToyModel()
@@ -143,103 +130,6 @@ def test_the_lookahead_takes_a_stronger_action_where_it_comes_nearer() -> None:
         with torch.inference_mode():
             set_plan(agent, [START, (START[0], START[1] + 9.0)])
         np.testing.assert_allclose(agent.act(frames_at(START))[0], [0.0, ACTION_SCALE * strength], atol=0.03)
-
-
-@pytest.mark.parametrize(("held", "strength"), [(0, 0.4), (3, 1.0)])
-def test_near_the_goal_a_stronger_action_than_the_policys_wins_by_its_value(held: int, strength: float) -> None:
-    model = ToyModel()
-    model.act_global = lambda latent: torch.tensor([0.4, 0.0], dtype=latent.dtype).expand_as(latent)
-    agent = VelapAgent(model, override(toy_config(), controller={"goal_lookahead": held}))
-    action = agent.act(frames_at((1.5, 0.0)))
-    assert agent.near_goal.tolist() == [True]
-    np.testing.assert_allclose(action[0], [ACTION_SCALE * strength, 0.0], atol=0.03)
-
-
-def test_a_place_that_promises_the_goal_and_keeps_the_robot_loses_its_promise() -> None:
-    agent = VelapAgent(ToyModel(), override(toy_config(n_iter=20), controller={"revisit_penalty": 0.5}))
-    near, other = (1.5, 0.0), (5.5, 0.0)
-    agent.reset(np.ones(2, bool), np.array([0, 1]))
-    led = []
-    for _ in range(4):
-        agent.act(frames_at(near, START))
-        led.append(bool(agent.near_goal[0]))
-    # 4.5 steps away by Q^g, stop at 5: one visit more than half a step
-    assert led == [True, True, False, False]
-    agent.act(frames_at(other, START))
-    assert agent.near_goal.tolist() == [True, False], "elsewhere nothing is lost"
-    agent.reset(np.array([True, False]))
-    agent.act(frames_at(near, START))
-    assert agent.near_goal[0], "a new episode starts without a past"
-
-
-@pytest.mark.parametrize(("residuals", "leaves"), [(0, False), (20, True)])
-def test_residuals_leave_a_wall_that_the_dynamics_walk_through(residuals: int, leaves: bool) -> None:
-    model = ToyModel(step=lambda z, a: z + SPEED * a / a.norm(dim=-1, keepdim=True).clamp(min=1))
-    model.act_local = lambda latent, goal: (goal - latent) / (goal - latent).norm(dim=-1, keepdim=True)
-    agent = VelapAgent(model, override(toy_config(n_iter=1), controller={"residuals": residuals, "n_replan": 100}))
-    env, start = ToyEnv(), (-0.1, 2.0)
-    env.reset(seed=0)
-    env.set_agent_position(np.array(start))
-    model.encode = lambda frames, commands=None: torch.from_numpy(env.agent_position())[None]
-    agent.act(frames_at(start))
-    with torch.inference_mode():
-        set_plan(agent, [start, (5.0, 2.0)])
-    for _ in range(10):
-        env.step(agent.act(frames_at(tuple(env.agent_position())))[0])
-    assert (env.agent_position()[1] != start[1]) == leaves
-
-
-def test_plans_grow_along_the_corrected_dynamics() -> None:
-    model = ToyModel(step=lambda z, a: z + SPEED * a / a.norm(dim=-1, keepdim=True).clamp(min=1))
-    agent = VelapAgent(model, override(toy_config(n_iter=40), controller={"residuals": 20, "n_replan": 3}))
-    stuck = frames_at(START, START)
-    agent.reset(np.ones(2, bool), np.array([1, 1]))
-    agent.act(stuck)
-    assert agent.last_plan_rows.tolist() == [0, 1]
-    first = agent.last_plan
-    assert first is not None
-    for _ in range(3):
-        agent.act(stuck)  # whatever it does, it stays
-    assert agent.planned_rows.tolist() == [0, 1]
-    assert len(agent.last_plan_rows) == 1, "rows with corrections plan alone"
-    assert np.isfinite(agent.last_plan_ms).all()
-    assert agent.last_plan is not None
-    assert not torch.equal(agent.last_plan.tree.latents[0, 1], first.tree.latents[0, 1])
-
-
-def round_the_wall(z: torch.Tensor) -> torch.Tensor:
-    """Half a step up to the tip of the wall, over it, and down to the goal."""
-    x, y = z.unbind(-1)
-    up, over = z.new_tensor([0.0, 0.5]), z.new_tensor([0.5, 0.0])
-    to_goal = 0.5 * (z.new_tensor(GOAL) - z) / (z.new_tensor(GOAL) - z).norm(dim=-1, keepdim=True)
-    before = torch.where((y < TIP + 1).unsqueeze(-1), up, over)
-    return torch.where((x < 0.5).unsqueeze(-1), before, to_goal)
-
-
-@pytest.mark.parametrize(("horizon", "leads"), [(0, False), (12, False), (40, True)])
-def test_the_policy_of_successes_acts_where_it_gets_to_the_goal_in_time(horizon: int, leads: bool) -> None:
-    controller = {"success_rollout": horizon}
-    config = override(toy_config(n_iter=20), train={"clone": {"steps": 1}}, controller=controller)
-    agent = VelapAgent(ToyModel(act_success=round_the_wall), config)
-    action = agent.act(frames_at(START))
-    assert (len(agent.planned_rows) == 0) == leads, "either it acts or a tree is grown"
-    if leads:
-        # its action at the highest gain that the box allows is there first
-        np.testing.assert_allclose(action[0], [0.0, ACTION_SCALE], atol=0.03)
-
-
-def test_rows_are_led_by_the_policy_of_successes_each_for_itself() -> None:
-    config = override(toy_config(n_iter=20), train={"clone": {"steps": 1}}, controller={"success_rollout": 15})
-    agent = VelapAgent(ToyModel(act_success=round_the_wall), config)
-    agent.act(frames_at(START, (-1.0, 8.0), (9.0, 9.0)))
-    assert agent.planned_rows.tolist() == [0], "too far in the first, near enough in the others"
-    assert agent.led.tolist() == [False, True, True]
-
-
-def test_a_model_without_a_policy_of_successes_is_refused() -> None:
-    config = override(toy_config(), train={"clone": {"steps": 1}}, controller={"success_rollout": 15})
-    with pytest.raises(ConfigError, match="clone"):
-        VelapAgent(ToyModel(), config)
 
 
 def test_plan_of_the_root_alone_leaves_it_to_the_global_policy() -> None:

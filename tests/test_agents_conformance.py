@@ -31,16 +31,16 @@ QUICK: dict[str, dict[str, Any]] = {
     "iris": {"samples": 8},
     "iris-multistep": {"samples": 8, "rollout": 3},
 }
-WHOLE = ("velap", "velap-provenance")
+WHOLE = ("velap",)
 """Methods that act by the whole checkpoint."""
 HORIZON = 3
 """How far ahead the subgoals of the test's heads lie [steps]."""
 
 
 def small_config() -> Config:
-    model = {"encoder": "tiny", "frame_stack": STACK, "latent_dim": 5, "bank_size": 0}
+    model = {"encoder": "tiny", "frame_stack": STACK, "latent_dim": 5, "bank_size": 8}
     base = Config(task="toy", preset="default")
-    return override(base, model=model, controller={"n_replan": 4, "residuals": 3},
+    return override(base, model=model, controller={"n_replan": 4},
                     planner={"n_iter": 12, "candidates": 4, "n_sim": 2, "discard_low_exponent": 1e4,
                              "discard_high_exponent": 1e-6})
 
@@ -53,6 +53,9 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     model = LatentModel(config.model, Spaces(SIDE, SIDE, tuple(LOW.tolist()), tuple(HIGH.tolist())), 0.96)
     model.step_distance.fill_(0.5)
+    model.bank_latents.normal_()
+    model.bank_rows.copy_(torch.arange(8))
+    model.missed.fill_(0.1)
     save_checkpoint(path, model, config, {"seed": "3"})
     _, _, metadata = load_checkpoint(path)
     for method in learning_methods():
@@ -152,11 +155,11 @@ def test_act_without_reset_and_with_another_batch(checkpoint: Path, method: str)
 @every_method
 def test_plans_are_timed_in_the_rows_that_plan(checkpoint: Path, method: str) -> None:
     agent = _reset(build(checkpoint, method), np.arange(2))
-    period = 4 if method == "velap" else 3 if method in QUICK else 0
+    period = 3 if method in QUICK else 0
     for time in range(8):
         agent.act(frames_of(2, time=time))
         planned = np.isfinite(agent.last_plan_ms)
-        if method == "velap-provenance":  # plans anew where a promise is broken; the first step always plans
+        if method == "velap":  # plans anew where a promise is broken; the first step always plans
             assert planned.all() or time > 0
             continue
         assert planned.tolist() == [period > 0 and time % period == 0] * 2
@@ -187,7 +190,7 @@ def test_on_a_gpu_actions_are_those_of_the_cpu(checkpoint: Path, method: str) ->
 
 def test_methods_are_those_of_table_1_and_three_of_ours() -> None:
     assert set(METHODS) == {"velap", "bc", "bc-success", "td3bc", "iql", "iql-sparse", "mppi", "mbop", "iris",
-                            "iris-multistep", "random", "velap-provenance"}
+                            "iris-multistep", "random"}
     assert len({get_method(method).label for method in METHODS}) == len(METHODS)
 
 
@@ -200,7 +203,7 @@ def test_the_config_hash_covers_all_that_decides_the_method(checkpoint: Path, me
     others = {get_method(other).config_hash(config, head_of(checkpoint, other)) for other in METHODS if other != method}
     assert own not in others
     assert (own == config.hash()) == (method == "velap")
-    planner, clone = {"planner": {"n_iter": 7}}, {"train": {"clone": {"steps": 9}}, "controller": {"success_rollout": 9}}
+    planner, clone = {"planner": {"n_iter": 7}}, {"train": {"clone": {"steps": 9}}}
     for changes in (planner, clone):
         changed = kind.config_hash(override(config, **changes), head)
         assert (own != changed) == (method in WHOLE), "what the tree and its controller alone act by"

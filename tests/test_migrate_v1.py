@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 from safetensors import safe_open
+from velap.config.migrate_v1 import legacy_json, legacy_shared_json, to_v1
 
 from velap.config import Config, EnsemblePhase, JointPhase, legacy_hash, override
-from velap.config.migrate_v1 import legacy_json, legacy_shared_json, to_v1
 from velap.errors import ConfigError
 from velap.evaluation.records import read_records
 from velap.methods.base import get_method

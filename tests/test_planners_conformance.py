@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from toy_world import roots, row_generators, toy_fns
-from velap.config.planning import PlannerConfig
+from toy_world import algorithm_1, roots, row_generators, toy_fns
 from velap.registry import PLANNERS
 from velap.search.types import Path
 
-CONFIG = PlannerConfig(n_iter=60, candidates=20, n_sim=3)
+CONFIG = algorithm_1(n_iter=60, candidates=20, n_sim=3)
 every_planner = pytest.mark.parametrize("name", PLANNERS)
 
 

@@ -8,17 +8,31 @@ import numpy as np
 import pytest
 import torch
 
-from toy_env import ACTION_SCALE, ToyModel, draw, toy_config
+from toy_env import ACTION_SCALE, ToyEnv, ToyModel, draw, toy_config
 from toy_world import GOAL, START, TIP, crosses_wall, geodesic, move, roots, row_generators, straight_to_goal, toy_fns
+from velap.config import override
 from velap.config.planning import PlannerConfig
-from velap.methods.provenance import ProvenanceAgent
+from velap.errors import ConfigError
+from velap.methods.base import make_agent
+from velap.methods.provenance import PATIENCE, ProvenanceAgent
+from velap.methods.tree_agent import Actor
+from velap.methods.velap import VelapAgent, VelapSettings
+from velap.models.horizon import q_from_steps
+from velap.registry import PLANNERS
+from velap.search import est
 from velap.search.provenance import Provenance, plan
+from velap.search.risk import AHEAD, COST, DISTANCES, PRIOR, Risk, measured_risk
 
-CONFIG = PlannerConfig(n_iter=400, n_sim=5, candidates=10, discard_low_exponent=10.0, p_sparse=0.9, p_value=0.1,
-                       expansion_weight=1.0)
+CONFIG = PlannerConfig(n_iter=400, n_sim=5, discard_low_exponent=10.0)
 
 
-def search(start: tuple[float, float], risk: float = 30.0, **changes: object) -> Provenance:
+def flat_risk(of_model: float, *of_policies: float) -> Risk:
+    """A risk that is the same at all distances."""
+    return Risk(of_model, torch.tensor(of_policies or (0.0,)).unsqueeze(1).expand(-1, len(DISTANCES) + 1))
+
+
+def search(start: tuple[float, float], risk: Risk | None = None, **changes: object) -> Provenance:
+    risk = flat_risk(30.0) if risk is None else risk
     return plan(toy_fns(**changes), torch.tensor([start]), CONFIG, row_generators(1), policies=[straight_to_goal], risk=risk)
 
 
@@ -34,7 +48,7 @@ def test_the_policys_own_way_is_taken_where_it_leads_to_the_goal() -> None:
     assert found.reached_goal.all()
     assert {who for _, _, who in edges(found)} == {1}
     assert len(edges(found)) <= 2
-    assert not (search((1.0, -8.0), risk=0.0).proposers == 1).all(), "edges of g are shorter where they carry no risk"
+    assert not (search((1.0, -8.0), flat_risk(0.0)).proposers == 1).all(), "edges of g are shorter where they carry no risk"
 
 
 def test_an_edge_of_the_policy_is_its_own_walk_of_n_sim_steps() -> None:
@@ -70,14 +84,15 @@ def test_an_edge_costs_n_sim_steps_by_the_policy_and_its_distance_by_g() -> None
     for (a, b, who), slot, before in zip(edges(found), found.nodes[0, 1:].tolist(), found.nodes[0].tolist(), strict=False):
         cost = float(tree.root_steps[0, slot] - tree.root_steps[0, before])
         assert cost == pytest.approx(CONFIG.n_sim if who == 1 else float(geodesic(a, b)), abs=1e-3)
+    by_g = found.proposers[0, : int(found.length[0])].tolist().count(0) - 1  # the root has no edge
+    assert float(found.cost[0]) == pytest.approx(float(tree.root_steps[0, found.nodes[0, -1]]) + 30.0 * by_g, abs=1e-3)
 
 
 def test_a_row_is_planned_by_its_own_generator_alone() -> None:
-    z_root = roots(3, spread=3.0)
-    fns = toy_fns()
-    together = plan(fns, z_root, CONFIG, row_generators(3, 5), policies=[straight_to_goal], risk=30.0)
+    z_root, fns, risk = roots(3, spread=3.0), toy_fns(), flat_risk(30.0)
+    together = plan(fns, z_root, CONFIG, row_generators(3, 5), policies=[straight_to_goal], risk=risk)
     for row in range(3):
-        alone = plan(fns, z_root[row : row + 1], CONFIG, row_generators(1, 5 + row), policies=[straight_to_goal], risk=30.0)
+        alone = plan(fns, z_root[row : row + 1], CONFIG, row_generators(1, 5 + row), policies=[straight_to_goal], risk=risk)
         length = int(alone.length[0])
         assert int(together.length[row]) == length
         torch.testing.assert_close(alone.waypoints[0, :length], together.waypoints[row, :length])
@@ -93,11 +108,11 @@ def set_plan(agent: ProvenanceAgent, waypoints: list[tuple[float, float]], propo
     """Let row 0 follow this plan, its root first."""
     made = replace(search(START), waypoints=torch.tensor([waypoints]), length=torch.tensor([len(waypoints)]),
                    proposers=torch.tensor([proposers]), steps_to_goal=torch.tensor([promised]))
-    agent.follow(torch.tensor([0]), made, torch.tensor(promised[:1]))
+    agent.follow(torch.tensor([0]), made)
 
 
-def new_agent() -> ProvenanceAgent:
-    agent = ProvenanceAgent(ToyModel(), toy_config(), risk=30.0)
+def new_agent(**changes: object) -> ProvenanceAgent:
+    agent = ProvenanceAgent(ToyModel(**changes), toy_config(provenance=True))
     agent.reset(np.ones(1, bool), np.array([0]))
     return agent
 
@@ -107,11 +122,15 @@ def test_every_edge_is_walked_by_its_proposer() -> None:
     set_plan(agent, [START, (-6.0, 5.0)], [0, 0], [12.0, 13.0])
     by_g = agent.act(frames_at(START))[0]
     assert by_g[1] > 0.8 * ACTION_SCALE, "an edge of g is walked to its waypoint, which is above"
-    assert agent.by_plan.all()
+    assert agent.by_plan.all() and agent.last_actors == [Actor.LOCAL]
     agent = new_agent()
     set_plan(agent, [START, (-6.0, 5.0)], [0, 1], [12.0, 7.0])
     np.testing.assert_allclose(agent.act(frames_at(START))[0], [ACTION_SCALE, 0.0], atol=0.03)
-    assert agent.by_plan.all()
+    assert agent.by_plan.all() and agent.last_actors == [Actor.POLICY]
+    agent = new_agent(act_success=lambda z: z.new_tensor([0.0, -1.0]).expand_as(z))
+    set_plan(agent, [START, (-6.0, 5.0)], [0, 2], [12.0, 7.0])
+    np.testing.assert_allclose(agent.act(frames_at(START))[0], [0.0, -ACTION_SCALE], atol=0.03)
+    assert agent.by_plan.all() and agent.last_actors == [Actor.CLONE]
 
 
 def test_a_promise_that_does_not_come_true_ends_the_plan() -> None:
@@ -128,4 +147,80 @@ def test_near_the_goal_the_global_policy_acts_and_nothing_is_planned() -> None:
     agent = new_agent()
     np.testing.assert_allclose(agent.act(frames_at((2.0, 0.0)))[0], [ACTION_SCALE, 0.0], atol=0.03)
     assert not np.isfinite(agent.last_plan_ms).any()
-    assert agent.near_goal.all() and not agent.by_plan.any()
+    assert agent.near_goal.all() and not agent.by_plan.any() and agent.last_actors == [Actor.GOAL]
+
+
+def test_where_the_tree_is_its_root_alone_the_global_policy_acts_and_no_plan_is_followed() -> None:
+    agent = new_agent(step=lambda z, action: z)
+    np.testing.assert_allclose(agent.act(frames_at(START))[0], [ACTION_SCALE, 0.0], atol=0.03)
+    assert agent.plans.length.tolist() == [1]
+    assert not agent.by_plan.any() and agent.last_actors == [Actor.NOWHERE]
+
+
+def test_an_edge_of_g_that_is_not_walked_in_time_ends_the_plan() -> None:
+    agent = new_agent()
+    set_plan(agent, [START, (-6.0, 8.0), (0.0, 8.0)], [0, 0, 0], [12.0, 14.0, 10.0])
+    planned, patience = [], PATIENCE * toy_config().planner.n_sim
+    for _ in range(patience + 2):  # the block stands still
+        agent.act(frames_at(START))
+        planned.append(bool(np.isfinite(agent.last_plan_ms).any()))
+    assert planned.index(True) == patience - 1
+
+
+def test_the_config_and_the_planner_decide_which_agent_acts(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, space = ToyModel(), ToyEnv().action_space
+    kinds = {provenance: type(make_agent("velap", model, toy_config(provenance=provenance), space))  # type: ignore[arg-type]
+             for provenance in (True, False)}
+    assert kinds == {True: ProvenanceAgent, False: VelapAgent}
+    monkeypatch.setitem(PLANNERS, "mine", est.plan)
+    agent = make_agent("velap", model, toy_config(provenance=True), space,  # type: ignore[arg-type]
+                       settings=VelapSettings("mine"))
+    assert type(agent) is VelapAgent, "another planner's waypoints are followed by Algorithm 2"
+
+
+def test_provenance_without_a_bank_is_refused() -> None:
+    with pytest.raises(ConfigError, match="`provenance` is True; expected false where `bank_size` is 0"):
+        override(toy_config(provenance=True), model={"bank_size": 0})
+
+
+# what edges risk
+
+
+def test_the_risk_is_that_of_the_promises_that_h_does_not_keep() -> None:
+    """A line: the goal is at 0, Q^g counts the way to it, and `half` walks half a step where a whole one is promised."""
+    fns = toy_fns(value=lambda z: q_from_steps(1, 0.96) ** z[..., 0].abs(), step=lambda z, action: z + action)
+    walk, stay = (lambda z, length=length: -length * torch.sign(z) for length in (0.5, 0.0))
+    states = torch.tensor([[8.0], [30.0], [30.0], [100.0], [2.0]], dtype=torch.float64)  # the last one is near the goal
+    risk = measured_risk(fns, [walk, stay], states, missed=0.4)
+    # `half` gets 5 of the 8 steps at 8 and 5 of 10 elsewhere; every class is filled up with PRIOR times the mean
+    kept = [5 / 8, 0.5, 0.5, 0.5]
+    usual = sum(kept) / 4
+    expected = [(5 / 8 + PRIOR * usual) / (1 + PRIOR), (1.0 + PRIOR * usual) / (2 + PRIOR), usual,
+                (0.5 + PRIOR * usual) / (1 + PRIOR), usual]
+    assert AHEAD == 10 and risk.of_model == pytest.approx(0.4 * COST)
+    np.testing.assert_allclose(risk.of_policies, [[COST * (1 - share) for share in expected], [COST] * 5], rtol=1e-5)
+    proposers, starts = torch.tensor([1, 1, 2]), torch.tensor([8.0, 100.0, 30.0])
+    np.testing.assert_allclose(risk.of_policy(proposers, starts), risk.of_policies[[0, 0, 1], [0, 3, 1]])
+
+
+def test_what_nothing_is_known_of_keeps_no_promise() -> None:
+    risk = measured_risk(toy_fns(), [straight_to_goal], torch.zeros(0, 2), missed=1.0)
+    assert risk.of_model == COST and (risk.of_policies == COST).all()
+
+
+def test_a_dearer_way_to_the_same_place_is_no_news_and_a_cheaper_one_is() -> None:
+    """All walks end at one place, 5 steps from the root. π^g's walk from the root is there first, at a cost of 5 and its
+    risk. An edge of g to it is news where that cost is no less than its own and n_sim = 5 more."""
+    place = torch.tensor([-1.0, 0.0])
+
+    def ways(of_model: float, of_policy: float) -> int:
+        """How many nodes lie at the place."""
+        fns = toy_fns(step=lambda z, action: place.expand_as(z), value=lambda z: torch.full(z.shape[:-1], 0.1))
+        found = plan(fns, torch.tensor([START]), replace(CONFIG, n_iter=20, candidates=2), row_generators(1),
+                     policies=[straight_to_goal], risk=flat_risk(of_model, of_policy))
+        return int(found.tree.size[0]) - 1
+
+    assert ways(30.0, 0.0) == 1
+    assert ways(0.0, 30.0) == 2
+    assert ways(0.0, 4.0) == 1, "cheaper by less than an edge"
+    assert ways(0.0, 6.0) == 2

@@ -8,14 +8,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from test_agents import round_the_wall
 from toy_env import SIDE, ToyEnv, ToyModel, draw, toy_config
+from toy_world import straight_to_goal
 from velap.config import override
 from velap.evaluation.rollout import FrameReader, Moment, Rollout
+from velap.methods.provenance import ProvenanceAgent
+from velap.methods.tree_agent import Actor, TreeAgent
 from velap.methods.velap import VelapAgent
 
 STARTS = ((-6.0, 0.0), (-3.0, -7.0), (1.5, 0.5), (-1.0, 7.0), (4.0, -8.0), (-8.0, 5.0), (9.0, 3.0), (-6.0, -1.0))
-"""Where the episode of each seed begins: far behind the wall, near the goal, and where a cloned policy arrives."""
+"""Where the episode of each seed begins: far behind the wall, near the goal, above and below it."""
 STEPS = 25
 
 
@@ -38,23 +40,15 @@ class RecordingEnv(ToyEnv):
         return super().step(action)
 
 
-class UpwardsModel(ToyModel):
-    """The toy model with a held policy, which moves up."""
-
-    def __init__(self, **changes: object) -> None:
-        super().__init__(**changes)
-        self.held_policy = lambda latent: latent.new_tensor([0.0, 1.0]).expand_as(latent)
-
-
-def actions_of(agent: VelapAgent, seeds: tuple[int, ...], batch: int) -> tuple[dict[int, np.ndarray], set[tuple[bool, ...]]]:
-    """The actions [steps, A] of every episode, and what rows did at one step: planned, were near the goal, were led."""
+def actions_of(agent: TreeAgent, seeds: tuple[int, ...],
+               batch: int) -> tuple[dict[int, np.ndarray], set[tuple[bool, Actor]]]:
+    """The actions [steps, A] of every episode, and what rows did at one step: whether they planned, and who acted."""
     taken: dict[int, list[np.ndarray]] = {}
-    modes: set[tuple[bool, ...]] = set()
+    modes: set[tuple[bool, Actor]] = set()
 
     def watch(moment: Moment) -> None:
         row = moment.row
-        following = len(agent.plans.ahead(row)) > 0 and not agent.near_goal[row]
-        modes.add((bool(row in agent.planned_rows), bool(agent.near_goal[row]), bool(agent.led[row]), following))
+        modes.add((bool(row in agent.planned_rows), agent.last_actors[row]))
 
     envs: list[gym.Env[Any, Any]] = [RecordingEnv(taken) for _ in range(batch)]
     rollout = Rollout(envs, agent, FrameReader(envs[0], SIDE, None), max_steps=STEPS, observer=watch)
@@ -62,24 +56,18 @@ def actions_of(agent: VelapAgent, seeds: tuple[int, ...], batch: int) -> tuple[d
     return {seed: np.stack(actions) for seed, actions in taken.items()}, modes
 
 
-@pytest.mark.parametrize("controller", [
-    {},
-    {"residuals": 10},
-    {"revisit_penalty": 0.3},
-    {"success_rollout": 15, "goal_lookahead": 2},
-    {"success_exponent": 3.0, "shortcut_exponent": 4.0},
-], ids=lambda controller: "-".join(controller) or "algorithm-2")
-def test_every_episode_takes_the_same_actions_in_any_batch(
-        controller: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("velap.methods.leaders.HELD_TURN", 3)
-    in_turns = "success_exponent" in controller
-    config = override(toy_config(n_iter=40), controller={"n_replan": 5, **controller},
-                      train={"clone": {"steps": 1}, "held": {"steps": int(in_turns)}})
+@pytest.mark.parametrize("provenance", [False, True], ids=["algorithm-2", "provenance"])
+def test_every_episode_takes_the_same_actions_in_any_batch(provenance: bool) -> None:
+    """π^g walks in the upper half of the world, the clone in the lower one."""
+    config = override(toy_config(n_iter=40, provenance=provenance), controller={"n_replan": 5})
+    kind = ProvenanceAgent if provenance else VelapAgent
 
-    def agent() -> VelapAgent:
-        model = UpwardsModel if in_turns else ToyModel
-        return VelapAgent(model(act_success=round_the_wall), config)  # type: ignore[arg-type]
+    def agent() -> TreeAgent:
+        model = ToyModel(act_global=lambda z: (z[..., 1:] > 0) * straight_to_goal(z),
+                         act_success=lambda z: (z[..., 1:] <= 0) * straight_to_goal(z))
+        return kind(model, config)  # type: ignore[arg-type]
 
+    acted: set[Actor] = set()
     every = tuple(range(len(STARTS)))
     alone: dict[int, np.ndarray] = {}
     for seed in every:
@@ -88,5 +76,7 @@ def test_every_episode_takes_the_same_actions_in_any_batch(
     for seeds, batch in ((every, 8), (every[::-1], 3), ((2, 0, 6, 1, 2), 2)):
         together, modes = actions_of(agent(), seeds, batch)
         assert len(modes) >= 3, f"rows did the same all the time: {modes}"
+        acted |= {actor for _, actor in modes}
         for seed, actions in together.items():
             np.testing.assert_allclose(actions, alone[seed], atol=1e-5, err_msg=f"seed {seed} in {seeds}, {batch} at once")
+    assert acted >= {Actor.LOCAL, Actor.GOAL} | ({Actor.POLICY, Actor.CLONE} if provenance else set())

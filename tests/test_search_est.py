@@ -14,6 +14,7 @@ from toy_world import (
     HALF_WIDTH,
     SPEED,
     TIP,
+    algorithm_1,
     geodesic,
     misleading_value,
     move,
@@ -22,13 +23,12 @@ from toy_world import (
     row_generators,
     toy_fns,
 )
-from velap.config.planning import PlannerConfig
 from velap.search import neighbours
 from velap.search.est import plan
 from velap.search.sampling import draw_noise
 from velap.search.types import Plan
 
-CONFIG = PlannerConfig(n_iter=250, n_sim=5, candidates=25, discard_low_exponent=6.0)
+CONFIG = algorithm_1(n_iter=250, n_sim=5, candidates=25, discard_low_exponent=6.0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,7 +53,7 @@ def through_walls(z: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(("seed", "candidates"), [(0, 1), (1, 1), (2, 1), (3, 1), (4, 1), (5, 1), (6, 7), (7, 7), (8, 50)])
 def test_equals_plain_python_algorithm_1(seed: int, candidates: int) -> None:
     coherent = seed % 2 == 0
-    cfg = PlannerConfig(
+    cfg = algorithm_1(
         n_iter=100, n_sim=4 if coherent else 10, candidates=candidates, p_policy=0.3, coherent_noise=coherent,
         discard_low_exponent=6.0 if coherent else None, goal_exponent=5.0 + 6 * (seed > 2),
         expansion_weight=0.5 * (seed in (2, 3, 6)),
@@ -169,7 +169,7 @@ def test_nothing_accepted_leaves_the_root(broken: str) -> None:
 
 def test_a_full_tree_when_everything_is_accepted() -> None:
     accept_all = toy_fns(reach=lambda a, b: (torch.full_like(a[..., 0], DISCOUNT**3), a[..., 0] * 0))
-    cfg = PlannerConfig(n_iter=30, candidates=7, n_sim=4, goal_exponent=1.0)
+    cfg = algorithm_1(n_iter=30, candidates=7, n_sim=4, goal_exponent=1.0)
     found = plan(accept_all, roots(2), cfg, row_generators(2))
     assert found.tree.size.tolist() == [31, 31]
     assert (found.tree.parents[:, 1:] >= 0).all()
@@ -179,7 +179,7 @@ def test_a_full_tree_when_everything_is_accepted() -> None:
 
 
 def test_without_a_goal_the_path_leads_to_the_highest_value() -> None:
-    cfg = PlannerConfig(n_iter=60, discard_low_exponent=6.0, goal_exponent=0.0)
+    cfg = algorithm_1(n_iter=60, discard_low_exponent=6.0, goal_exponent=0.0)
     found = plan(toy_fns(), roots(3, spread=2.0), cfg, row_generators(3))
     assert found.reached_goal.tolist() == [False] * 3
     leaf = found.nodes[:, -1]
@@ -188,7 +188,7 @@ def test_without_a_goal_the_path_leads_to_the_highest_value() -> None:
 
 
 def test_of_several_goal_nodes_the_nearest_is_chosen() -> None:
-    cfg = PlannerConfig(n_iter=100, discard_low_exponent=6.0, goal_exponent=11.0)
+    cfg = algorithm_1(n_iter=100, discard_low_exponent=6.0, goal_exponent=11.0)
     found = plan(toy_fns(), roots(4), cfg, row_generators(4))
     is_goal = found.tree.goal_values > DISCOUNT**11
     assert (is_goal.sum(1) > 1).all()
@@ -198,7 +198,7 @@ def test_of_several_goal_nodes_the_nearest_is_chosen() -> None:
 
 
 def test_iterations_count_expansions_not_rounds() -> None:
-    cfg = PlannerConfig(n_iter=60, candidates=25, discard_low_exponent=6.0)
+    cfg = algorithm_1(n_iter=60, candidates=25, discard_low_exponent=6.0)
     calls: list[int] = []
 
     def counted(z: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
@@ -229,11 +229,11 @@ def test_few_rows_are_planned_on_one_thread_and_the_setting_comes_back():
         return misleading_value(z)
 
     try:
-        plan(toy_fns(value=counted), roots(1), PlannerConfig(n_iter=20, candidates=10), torch.Generator().manual_seed(0))
+        plan(toy_fns(value=counted), roots(1), algorithm_1(n_iter=20, candidates=10), torch.Generator().manual_seed(0))
         assert set(seen) == {1}
         assert torch.get_num_threads() == 2
         seen.clear()
-        plan(toy_fns(value=counted), roots(32), PlannerConfig(n_iter=20, candidates=10), torch.Generator().manual_seed(0))
+        plan(toy_fns(value=counted), roots(32), algorithm_1(n_iter=20, candidates=10), torch.Generator().manual_seed(0))
         assert set(seen) == {2}
     finally:
         torch.set_num_threads(before)

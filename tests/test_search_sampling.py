@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
+from toy_world import algorithm_1
 from velap.config.planning import PlannerConfig
 from velap.search.sampling import TEMPERATURE_SPARSE, TEMPERATURE_VALUE, draw_noise, node_distribution, sample_nodes
 
@@ -25,7 +26,7 @@ def by_hand(cfg: PlannerConfig) -> torch.Tensor:
     ("p_sparse", "p_value"), [(1.0, 0.0), (0.0, 1.0), (0.0, 0.0), (0.4, 0.4), (0.7, 0.3)],
 )
 def test_distribution_is_eq_6_and_7(p_sparse: float, p_value: float) -> None:
-    cfg = PlannerConfig(p_sparse=p_sparse, p_value=p_value)
+    cfg = algorithm_1(p_sparse=p_sparse, p_value=p_value)
     found = node_distribution(COUNTS, VALUES, USED, cfg)
     torch.testing.assert_close(found[0, :4], by_hand(cfg), rtol=1e-6, atol=1e-7)
     assert found[0, 4].item() == 0
@@ -33,7 +34,7 @@ def test_distribution_is_eq_6_and_7(p_sparse: float, p_value: float) -> None:
 
 
 def test_draws_follow_the_distribution() -> None:
-    cfg = PlannerConfig(p_sparse=0.3, p_value=0.5)
+    cfg = algorithm_1(p_sparse=0.3, p_value=0.5)
     distribution = node_distribution(COUNTS, VALUES, USED, cfg)
     uniform = torch.rand(1, 20_000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     drawn = sample_nodes(distribution, uniform, torch.tensor([4]))
@@ -51,7 +52,7 @@ def test_draws_never_leave_the_tree_nor_hit_nodes_of_weight_zero() -> None:
 
 
 def test_noise_of_a_row_is_its_generators_alone() -> None:
-    cfg, like = PlannerConfig(n_iter=30, n_sim=5, coherent_noise=False), torch.zeros(3, 7)
+    cfg, like = algorithm_1(n_iter=30, n_sim=5, coherent_noise=False), torch.zeros(3, 7)
     make = lambda rows: [torch.Generator().manual_seed(10 + row) for row in rows]  # noqa: E731
     together = draw_noise(cfg, 4, like, make(range(3)))
     assert [tuple(part.shape) for part in together] == [(3, 30), (3, 30), (3, 30, 5, 4)]
@@ -61,5 +62,5 @@ def test_noise_of_a_row_is_its_generators_alone() -> None:
             torch.testing.assert_close(one[0], many[row], rtol=0, atol=0)
     assert not torch.equal(together.node, together.policy)
     assert abs(float(together.action.std()) - 1) < 0.05
-    assert draw_noise(PlannerConfig(n_iter=30), 4, like, make(range(3))).action.shape == (3, 30, 1, 4)
+    assert draw_noise(algorithm_1(n_iter=30), 4, like, make(range(3))).action.shape == (3, 30, 1, 4)
     assert together.part(5, 9).action.tolist() == together.action[:, 5:9].tolist()

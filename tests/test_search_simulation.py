@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toy_world import DISCOUNT, SPEED, reach, roots, row_generators, toy_fns
+from toy_world import DISCOUNT, SPEED, algorithm_1, reach, roots, row_generators, toy_fns
 from velap.config.planning import PlannerConfig
 from velap.errors import ConfigError
 from velap.search import est, neighbours, simulation
@@ -20,14 +20,14 @@ from velap.search.sampling import Noise, draw_noise
 from velap.search.simulation import simulate
 from velap.search.tree import new_tree, trimmed
 
-CONFIG = PlannerConfig(n_iter=100, n_sim=5, candidates=25, discard_low_exponent=6.0)
+CONFIG = algorithm_1(n_iter=100, n_sim=5, candidates=25, discard_low_exponent=6.0)
 
 
 def test_thresholds_are_the_exponents_of_table_8() -> None:
     like = torch.zeros(1, dtype=torch.float64)
-    found = thresholds(PlannerConfig(n_sim=10), 0.96, like)
+    found = thresholds(algorithm_1(n_sim=10), 0.96, like)
     assert [float(value) for value in found] == pytest.approx([0.96**2, 0.96**10, 0.04, 0.96**3, 0.96**5])
-    ours = thresholds(PlannerConfig(n_sim=10, discard_low_exponent=20.0), 0.96, like)
+    ours = thresholds(algorithm_1(n_sim=10, discard_low_exponent=20.0), 0.96, like)
     assert float(ours.low) == pytest.approx(0.96**20)
 
 
@@ -37,7 +37,7 @@ def test_thresholds_are_the_exponents_of_table_8() -> None:
     (DISCOUNT**5.01, 1.0, "low"), (DISCOUNT**1.99, 1.0, "std"),
 ])
 def test_each_rejection_at_its_threshold(q: float, std: float, field: str | None) -> None:
-    cfg = PlannerConfig(n_iter=1, n_sim=5, candidates=1)
+    cfg = algorithm_1(n_iter=1, n_sim=5, candidates=1)
     fns = toy_fns(reach=lambda a, b: (torch.full_like(a[..., 0], q), torch.full_like(a[..., 0], std)))
     found = plan(fns, roots(1), cfg, row_generators(1))
     assert found.tree.size.tolist() == [2 if field is None else 1]
@@ -50,7 +50,7 @@ def noise_of(actions: list[list[float]], by_policy: list[bool]) -> Noise:
 
 
 def test_simulation_repeats_coherent_noise_and_follows_the_policy_where_told() -> None:
-    cfg = PlannerConfig(n_sim=3, p_policy=0.5)
+    cfg = algorithm_1(n_sim=3, p_policy=0.5)
     start = torch.tensor([[[-6.0, 0.0], [-5.0, 0.0], [-6.0, 0.0]]], dtype=torch.float64)
     noise = noise_of([[0.0, 2.0], [0.0, 2.0], [-2.0, 0.0]], [False, True, False])
     found = simulate(toy_fns(), start, noise, cfg)[0]
@@ -59,7 +59,7 @@ def test_simulation_repeats_coherent_noise_and_follows_the_policy_where_told() -
 
 
 def test_simulation_without_coherence_draws_each_step() -> None:
-    cfg = PlannerConfig(n_sim=3, p_policy=0.0, coherent_noise=False)
+    cfg = algorithm_1(n_sim=3, p_policy=0.0, coherent_noise=False)
     noise = noise_of([[0.0, 1.0]], [False])._replace(action=torch.tensor([[[[0.0, 1], [-1, 0], [-1, 0]]]]).double())
     found = simulate(toy_fns(), roots(1)[:, None], noise, cfg)[0]
     torch.testing.assert_close(found, found.new_tensor([[-6 - 2 * SPEED, SPEED]]))
@@ -89,14 +89,14 @@ def test_first_come_along_the_longest_chain() -> None:
 
 
 def test_equal_candidates_of_one_round_enter_once() -> None:
-    cfg = PlannerConfig(n_iter=25, candidates=25, n_sim=4, p_policy=1.0, discard_low_exponent=6.0)
+    cfg = algorithm_1(n_iter=25, candidates=25, n_sim=4, p_policy=1.0, discard_low_exponent=6.0)
     found = plan(toy_fns(), roots(3), cfg, row_generators(3))
     assert found.tree.size.tolist() == [2, 2, 2]
     assert found.rejections.high.tolist() == [24, 24, 24]
 
 
 def test_candidates_of_one_round_are_novel_against_each_other() -> None:
-    cfg = PlannerConfig(n_iter=40, candidates=40, n_sim=5, discard_low_exponent=6.0, p_policy=0.0)
+    cfg = algorithm_1(n_iter=40, candidates=40, n_sim=5, discard_low_exponent=6.0, p_policy=0.0)
     tree = plan(toy_fns(), roots(1), cfg, row_generators(1)).tree
     nodes = tree.latents[0, : tree.size[0]]
     assert 8 < len(nodes) < 30
@@ -106,7 +106,7 @@ def test_candidates_of_one_round_are_novel_against_each_other() -> None:
 
 
 def test_only_the_nearest_neighbours_are_compared_with(monkeypatch: pytest.MonkeyPatch) -> None:
-    cfg = PlannerConfig(n_iter=100, candidates=1, n_sim=5, discard_low_exponent=6.0, p_sparse=0.0)
+    cfg = algorithm_1(n_iter=100, candidates=1, n_sim=5, discard_low_exponent=6.0, p_sparse=0.0)
     full = plan(toy_fns(), roots(1), cfg, row_generators(1)).tree
     monkeypatch.setattr(neighbours, "MAX_NEIGHBOURS", 1)
     few = plan(toy_fns(), roots(1), cfg, row_generators(1)).tree
@@ -135,7 +135,7 @@ def test_anchors_snap_to_the_data_and_refuse_what_they_do_not_support() -> None:
 
 def test_anchors_need_a_bank() -> None:
     with pytest.raises(ConfigError, match=r"`anchor` is 'snap'.*bank_size"):
-        plan(toy_fns(), roots(1), PlannerConfig(anchor="snap"), row_generators(1))
+        plan(toy_fns(), roots(1), algorithm_1(anchor="snap"), row_generators(1))
 
 
 def accept_all(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

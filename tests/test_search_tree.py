@@ -9,8 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toy_world import DISCOUNT, reach, roots, row_generators, toy_fns
-from velap.config.planning import PlannerConfig
+from toy_world import DISCOUNT, algorithm_1, reach, roots, row_generators, toy_fns
 from velap.search import neighbours
 from velap.search.est import plan
 from velap.search.tree import Candidates, free_slots, insert_, new_tree, take, trace_back, trimmed
@@ -87,7 +86,7 @@ def one_way_reach(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor,
 def test_trees_keep_their_properties(
     seed: int, candidates: int, n_iter: int, n_sim: int, coherent: bool, p_policy: float, high: float
 ) -> None:
-    cfg = PlannerConfig(
+    cfg = algorithm_1(
         n_iter=n_iter, candidates=candidates, n_sim=n_sim, coherent_noise=coherent, p_policy=p_policy,
         discard_high_exponent=high, discard_low_exponent=n_sim + 1.0, goal_exponent=9.0,
     )

@@ -25,10 +25,10 @@ from velap.errors import ConfigError
 from velap.evaluation.evaluate import Player, to_record
 from velap.evaluation.rollout import Episode
 from velap.methods.base import make_agent
+from velap.methods.tree_agent import Actor
 from velap.methods.velap import VelapAgent
 from velap.report import viewer, viewer_page
-from velap.report.viewer import GOAL as NEAR
-from velap.report.viewer import PLAN, Backdrop, Subject, Trace, backdrop_of, subject_of, trace
+from velap.report.viewer import Backdrop, Subject, Trace, backdrop_of, subject_of, trace
 from velap.report.viewer_page import GRID, LARGEST, MARK, episode_data, page
 from velap.search import est
 from velap.search import types as search
@@ -93,20 +93,22 @@ def test_plans_are_kept_when_they_are_made(player: Player, seen: Trace) -> None:
 
 
 def test_waypoints_come_in_turn_until_the_goal_is_near(seen: Trace) -> None:
-    stop = next((number for number, step in enumerate(seen.steps) if step.actor == NEAR), len(seen.steps))
-    assert {step.actor for step in seen.steps[:stop]} == {PLAN}
+    stop = next((number for number, step in enumerate(seen.steps) if step.actor == Actor.GOAL), len(seen.steps))
+    assert {step.actor for step in seen.steps[:stop]} == {Actor.LOCAL}
     for before, after in zip(seen.steps[: stop - 1], seen.steps[1:stop], strict=True):
         assert before.waypoint is not None and after.waypoint is not None
         assert after.plan != before.plan or after.waypoint >= before.waypoint
     assert max(step.waypoint or 0 for step in seen.steps) > 1
 
 
-def test_leaders_and_plans_that_lead_nowhere_are_told_apart(player: Player, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(VelapAgent, "led", property(lambda agent: np.ones(1, bool)))
-    assert {step.actor for step in trace(player, SEED).steps} == {"leader"}
-    monkeypatch.undo()
-    alone = toy_player(max_steps=4, n_iter=1)
-    assert [step.actor for step in trace(alone, SEED).steps][-1] in (PLAN, "nowhere")
+def test_who_proposed_an_edge_is_told_apart_from_who_leads_nowhere() -> None:
+    proposed = toy_player(n_iter=300, provenance=True)
+    actors = {step.actor for step in trace(proposed, SEED).steps}
+    assert {Actor.LOCAL, Actor.POLICY} <= actors, "g around the wall, π^g before and behind it"
+    for step in trace(proposed, SEED).steps:
+        assert (step.waypoint is None) == (step.actor in (Actor.GOAL, Actor.NOWHERE))
+    nowhere = toy_player(max_steps=4, n_iter=1)
+    assert [step.actor for step in trace(nowhere, SEED).steps][-1] in (Actor.LOCAL, Actor.NOWHERE)
 
 
 def test_another_method_shows_its_frames_alone(player: Player) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from toy_world import GOAL, HALF_WIDTH, START, TIP, crosses_wall, move, straight_to_goal, toy_fns
+from toy_world import GOAL, HALF_WIDTH, START, TIP, algorithm_1, crosses_wall, move, straight_to_goal, toy_fns
 from velap.config import Config, ModelConfig, override
 from velap.evaluation.evaluate import Player
 from velap.evaluation.records import RunKey
@@ -81,7 +81,10 @@ class ToyModel(nn.Module):
         super().__init__()
         self.anchor = nn.Parameter(torch.zeros(1, dtype=torch.float64))
         self._fns = toy_fns(**changes)
-        self.held_policy = None
+        axis = torch.arange(-9.0, 10.0, 3.0)
+        self.bank_latents = torch.cartesian_prod(axis, axis)
+        self.bank_rows = torch.arange(len(self.bank_latents))
+        self.missed = torch.tensor(0.2)
         self.encoded_batches: list[int] = []
 
     action_dim, config, memory = 2, ModelConfig(frame_stack=2), 0.0
@@ -114,10 +117,11 @@ class ToyModel(nn.Module):
 
 
 def toy_config(**planner: object) -> Config:
-    """Config for the toy world: short simulations, replanning every 10 steps."""
+    """Config for the toy world: Algorithms 1 and 2, replanning every 10 steps; `planner` replaces fields of the search."""
     base = Config(task="toy", preset="default")
-    settings = {"n_iter": 60, "n_sim": 3, "candidates": 20, **planner}
-    return override(base, planner=settings, controller={"n_replan": 10}, model={"frame_stack": 2})
+    settings = vars(algorithm_1(n_iter=60, n_sim=3, candidates=20)) | planner
+    return override(base, planner=settings, controller={"n_replan": 10, "lookahead_gain": 1.0},
+                    model={"frame_stack": 2})
 
 
 def toy_env() -> gym.Env[Any, Any]:
@@ -125,9 +129,9 @@ def toy_env() -> gym.Env[Any, Any]:
     return gym.wrappers.TimeLimit(ToyEnv(), 60)
 
 
-def toy_player(max_steps: int = 60, n_iter: int = 300) -> Player:
-    """VELAP in the toy world."""
-    model, config = ToyModel(), toy_config(n_iter=n_iter)
+def toy_player(max_steps: int = 60, n_iter: int = 300, **planner: object) -> Player:
+    """VELAP in the toy world; `planner` replaces fields of the search."""
+    model, config = ToyModel(), toy_config(n_iter=n_iter, **planner)
     key = RunKey(task="toy", method="velap", preset="default", train_seed=0, env="toy-v0", config_hash="0" * 12,
                  checkpoint="", code_version="test", max_steps=max_steps)
     agent = make_agent("velap", model, config, ToyEnv().action_space)  # type: ignore[arg-type]

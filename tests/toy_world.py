@@ -6,9 +6,12 @@ The goal value knows nothing of the wall: climbing it ends behind the wall, whic
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from velap.config.planning import PlannerConfig
 from velap.search.types import SearchFns
 
 DISCOUNT = 0.96
@@ -80,6 +83,14 @@ def toy_fns(**changes: object) -> SearchFns:
         step_distance=1.0,
     )
     return fns._replace(**changes)
+
+
+def algorithm_1(**changes: Any) -> PlannerConfig:
+    """Algorithm 1 without what is ours but coherent noise; `changes` replaces fields."""
+    plain: dict[str, Any] = {
+        "provenance": False, "n_iter": 250, "n_sim": 5, "candidates": 50, "discard_low_exponent": None, "p_sparse": 0.4,
+        "p_value": 0.4, "expansion_weight": 0.0, "anchor": "none"}
+    return PlannerConfig(**{**plain, **changes})
 
 
 def roots(batch: int, spread: float = 0.0, seed: int = 0) -> Tensor:

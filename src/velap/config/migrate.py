@@ -104,10 +104,12 @@ def _acting(raw: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     from velap.config.presets import paper
 
     own = paper(raw["task"])
-    planner_fields, controller_fields = ({**vars(part), **{name: fields[name] for name in hints(type(part)) if name in fields}}
-                                         for part, fields in ((own.planner, raw["planner"]),
-                                                              (own.controller, raw["controller"])))
-    return planner_fields, controller_fields
+    return _kept(own.planner, raw["planner"]), _kept(own.controller, raw["controller"])
+
+
+def _kept(part: PlannerConfig | ControllerConfig, fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a part of today's config, with what a file says of them."""
+    return {**vars(part), **{name: fields[name] for name in hints(type(part)) if name in fields}}
 
 
 def _from_v1(raw: dict[str, Any]) -> Config:

@@ -12,9 +12,9 @@ Precision = Literal["float32", "bfloat16"]
 NEIGHBOUR_DISTANCE = 3.0
 """d_neigh in upper 5-percentiles of one-step latent distances, Table 8."""
 SNAP_GAP = 0.5
-"""Where `auto` anchors, most held-out latents lie nearer to the bank than this [one-step distances]. ours: an anchor then moves
-a candidate by less than half a step and undoes errors of h that lead nowhere real. Where the bank has wider gaps, anchors move
-candidates by as much as a step does."""
+"""Where `auto` anchors, most held-out latents lie nearer to the bank than this [one-step distances]. ours: an anchor then
+moves a candidate by less than half a step and undoes errors of h that lead nowhere real. Where the bank has wider gaps,
+anchors move candidates by as much as a step does."""
 
 
 @dataclass(frozen=True)
