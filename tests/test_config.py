@@ -60,9 +60,10 @@ def test_what_is_ours_is_off_in_the_paper_preset() -> None:
     model = config.model
     assert (model.dynamics_residual, model.critic_bounded, model.bank_size, model.command_dims) == (False, False, 0, 0)
     assert (config.train.group_windows, config.train.critic_loss, config.train.policy_every) == (1, "mse", 1)
-    assert config.controller == ControllerConfig(n_replan=25, lookahead=0)
-    assert not config.planner.coherent_noise
+    assert config.controller == ControllerConfig(n_replan=25, lookahead=0, lookahead_gain=1.0)
+    assert not config.planner.provenance and not config.planner.coherent_noise
     assert (config.planner.anchor, config.planner.expansion_weight) == ("none", 0)
+    assert (config.planner.p_sparse, config.planner.p_value, config.planner.p_policy, config.planner.candidates) == (0.4, 0.4, 0.2, 50)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: f"{config.task}-{config.preset}")
@@ -70,7 +71,7 @@ def test_json_is_whole_exact_and_canonical(config: Config) -> None:
     text = config.to_json()
     assert Config.from_json(text) == config
     raw = json.loads(text)
-    assert raw["schema"] == 2
+    assert raw["schema"] == 3
     for part, cls in PARTS.items():
         assert set(raw[part]) == {field.name for field in dataclasses.fields(cls)}
     for phase, saved in zip(config.train.phases, raw["train"]["phases"], strict=True):
@@ -114,8 +115,8 @@ def test_the_hash_is_of_every_field_that_decides_a_result() -> None:
     hashes = {name: config.hash() for name, config in others.items()}
     assert {name for name, value in hashes.items() if value == base.hash()} == cadences
     assert len(set(hashes.values())) == len(hashes) - len(cadences) + 1
-    shorter = override(base, train={"clone": {"steps": 0}}, controller={"success_exponent": 0.0})
-    again = override(shorter, train={"clone": {"steps": 3_000, "reach": 25}}, controller={"success_exponent": 30.0})
+    shorter = override(base, train={"clone": {"steps": 0}})
+    again = override(shorter, train={"clone": {"steps": 3_000}})
     assert shorter.hash() != again.hash() == base.hash()
 
 
@@ -146,7 +147,7 @@ def test_every_field_says_what_it_is_and_where_it_comes_from() -> None:
             meaning = docs(cls)[name]
             assert any(word in meaning for word in ("Table", "Eq.", "App.", "ours", "learnt, in this order")), (cls, name)
     described = {name for name, *_ in describe(make_config("SpiralMaze"))}
-    assert {"model.encoder", "train.joint.c1", "train.held.hold", "planner.p_sparse", "controller.n_replan"} <= described
+    assert {"model.encoder", "train.joint.c1", "train.clone.candidates", "planner.p_sparse", "controller.n_replan"} <= described
     assert all(all(row) for row in describe(make_config("SpiralMaze")))
 
 
@@ -159,12 +160,12 @@ def test_every_field_says_what_it_is_and_where_it_comes_from() -> None:
     (lambda: JointPhase(0), r"joint\.steps"), (lambda: JointPhase(4, rewarded_share=1.5), r"joint\.rewarded_share"),
     (lambda: JointPhase(4, dynamics_loss="l1"), r"joint\.dynamics_loss"),  # type: ignore[arg-type]
     (lambda: EncoderPhase(4, pairs=0), r"encoder\.pairs"), (lambda: LatentPhase(4, horizon=0), r"latent\.horizon"),
-    (lambda: EnsemblePhase(4, hold=0), r"ensemble\.hold"), (lambda: ClonePhase(4, candidates=0), r"clone\.candidates"),
+    (lambda: EnsemblePhase(4, members=0), r"ensemble\.members"), (lambda: ClonePhase(4, candidates=0), r"clone\.candidates"),
     (lambda: TrainConfig(phases=(LatentPhase(1), JointPhase(1))), "before those on frozen latents"),
     (lambda: TrainConfig(phases=(JointPhase(1), JointPhase(2))), "each kind of phase once"),
-    (lambda: PlannerConfig(n_iter=0), "n_iter"), (lambda: PlannerConfig(p_sparse=0.9), "p_sparse"),
+    (lambda: PlannerConfig(n_iter=0), "n_iter"), (lambda: PlannerConfig(p_sparse=0.95), "p_sparse"),
     (lambda: PlannerConfig(anchor="glue"), "anchor"),  # type: ignore[arg-type]
-    (lambda: ControllerConfig(n_replan=0), "n_replan"), (lambda: ControllerConfig(residuals=-1), "residuals"),
+    (lambda: ControllerConfig(n_replan=0), "n_replan"), (lambda: ControllerConfig(lookahead=-1), "lookahead"),
 ])
 def test_values_out_of_range_name_their_field(make: Any, field: str) -> None:
     with pytest.raises(ConfigError, match=field):
@@ -176,10 +177,10 @@ def test_values_out_of_range_name_their_field(make: Any, field: str) -> None:
     ("planner", {"n_iter": 2.5}, r"planner\.n_iter` is 2.5; expected int"),
     ("planner", {"n_iter": None}, r"planner\.n_iter` is None; expected int"),
     ("planner", {"coherent_noise": 1}, r"planner\.coherent_noise` is 1; expected bool"),
-    ("planner", {"anchor": "glue"}, "expected 'none' or 'snap'"),
+    ("planner", {"anchor": "glue"}, "expected 'auto' or 'none' or 'snap'"),
     ("train", {"joint": {"steps": True}}, r"train\.joint\.steps` is True; expected int"),
     ("train", {"joint": {"stpes": 1}}, r"`train\.joint` has no field 'stpes'; expected some of .*steps"),
-    ("train", {"clone": {"reach": 1}}, r"no phase 'clone'.*train\.clone\.steps"),
+    ("train", {"clone": {"candidates": 1}}, r"no phase 'clone'.*train\.clone\.steps"),
     ("train", {"joint_steps": 1}, r"`train` has no field 'joint_steps'"),
     ("trian", {"c0": 1.0}, "no part 'trian'"),
 ])
@@ -198,21 +199,20 @@ def test_whole_numbers_and_null_are_taken_where_they_fit() -> None:
 def test_phases_are_changed_put_in_and_left_out_by_their_label() -> None:
     base = make_config("DrawerButton")
     labels = [phase.label for phase in base.train.phases]
-    assert labels == ["encoder", "latent", "ensemble", "held", "clone"]
-    changed = override(base, train={"held": {"members": 2}, "clone": {"steps": 0}, "joint": {"steps": 7, "c1": 0.5}},
-                       controller={"success_exponent": 0.0})
-    assert [phase.label for phase in changed.train.phases] == ["encoder", "joint", "latent", "ensemble", "held"]
-    held, joint = changed.train.phases[4], changed.train.phases[1]
-    assert isinstance(held, EnsemblePhase) and (held.members, held.hold) == (2, 5)
+    assert labels == ["encoder", "latent", "ensemble", "clone"]
+    changed = override(base, train={"ensemble": {"members": 2}, "clone": {"steps": 0}, "joint": {"steps": 7, "c1": 0.5}})
+    assert [phase.label for phase in changed.train.phases] == ["encoder", "joint", "latent", "ensemble"]
+    ensemble, joint = changed.train.phases[3], changed.train.phases[1]
+    assert isinstance(ensemble, EnsemblePhase) and ensemble.members == 2
     assert joint == JointPhase(7, c1=0.5)
     assert override(base, train={"joint": {"steps": 0}}) == base
-    assert override(make_config("SpiralMaze"), train={"held": {"steps": 9}}).train.holds
+    assert override(make_config("SpiralMaze"), train={"clone": {"steps": 9}}).train.clones
 
 
 def test_unknown_names_and_broken_files_are_refused() -> None:
     whole = json.loads(Config("task", "default").to_json())
     for change, expected in (
-        ({"extra": 1}, r"unknown fields \['extra'\]"), ({"schema": 3}, "schema 3; expected 2"),
+        ({"extra": 1}, r"unknown fields \['extra'\]"), ({"schema": 4}, "schema 4; expected 3"),
         ({"model": {}}, r"`config\.model`.* lacks \['bank_size'"), ({"planner": 4}, r"`config\.planner` is int"),
         ({"train": {**whole["train"], "phases": [{"phase": "dream"}]}}, "kind 'dream'"),
         ({"train": {**whole["train"], "c0": "big"}}, r"config\.train\.c0` is 'big'; expected float"),

@@ -1,20 +1,18 @@
-"""Several π^g with critics of their own, for single and held actions: what each learns from, what the model takes over."""
+"""Several π^g with critics of their own, what each learns from, what the model takes over."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from tiny_training import SMALL, config, make, make_store, moved, straight_and_resumed, touched, until, weights
-from velap.config import Config, override
+from tiny_training import SMALL, config, make, moved, straight_and_resumed, touched, until, weights
+from velap.config import Config
 from velap.errors import ConfigError
 from velap.losses import cross_entropy_critic_loss
 from velap.models.networks import EnsembleMLP
-from velap.training.ensemble import BATCH, held_transitions
-from velap.training.loop import Trainer
+from velap.training.ensemble import BATCH
 
 MANY = {"steps": 4, "members": 3}
-HELD = {"steps": 4, "members": 3, "hold": 3}
 
 
 @pytest.fixture(autouse=True)
@@ -25,11 +23,6 @@ def short_distillation(monkeypatch):
 def several(**changes) -> Config:
     """Every kind of phase on frozen latents."""
     return config(SMALL, **{"joint": {"steps": 1}, "latent": {"steps": 1}, "ensemble": MANY, **changes})
-
-
-def own(**changes) -> Config:
-    """With held actions and clones besides."""
-    return several(**{"ensemble": {"steps": 0}, "held": HELD, "clone": {"steps": 3, "reach": 2}, **changes})
 
 
 @pytest.mark.parametrize("outputs", [1, 3])
@@ -127,89 +120,12 @@ def test_a_training_with_members_resumes_to_the_same_bits(tmp_path, stop, noise)
     straight_and_resumed(tmp_path, several(ensemble={**MANY, "noise": noise}), stop)
 
 
-@pytest.mark.parametrize("steps", [1, 3, 50])
-def test_a_held_transition_is_what_its_steps_come_to(tmp_path, steps):
-    sampler = make(tmp_path, own()).sampler
-    held = held_transitions(sampler, steps, 0.9)
-    ended = 0
-    for row in sampler.transitions.tolist():
-        last = int(sampler.last[row])
-        taken = min(steps, last - row)
-        actions = sampler.actions[row : row + taken]
-        torch.testing.assert_close(held.actions[row], actions.mean(0))
-        rewards = sum(0.9**i * float(sampler.rewards[row + i]) for i in range(taken))
-        assert float(held.rewards[row]) == pytest.approx(rewards)
-        assert int(held.following[row]) == row + taken
-        over = bool(sampler.terminated[row : row + taken].any())
-        ended += over
-        assert float(held.alive[row]) == pytest.approx(0.0 if over else 0.9 ** (taken - 1))
-    assert ended == {1: 2, 3: 6, 50: 12}[steps], "two episodes of six steps end the task"
-    if steps == 1:
-        rows = sampler.transitions
-        assert torch.equal(held.actions[rows], sampler.actions[rows])
-        assert torch.equal(held.rewards[rows], sampler.rewards[rows])
+@pytest.mark.parametrize("stop", [9, 11])
+def test_a_training_with_a_clone_after_the_members_resumes_to_the_same_bits(tmp_path, stop):
+    straight_and_resumed(tmp_path, several(clone={"steps": 3}), stop)
 
 
-def test_what_comes_after_the_end_of_the_task_does_not_count(tmp_path):
-    store = make_store()
-    store.terminated[2], store.rewards[2] = True, 1.0  # in the middle of a recorded episode
-    sampler = Trainer(own(), store, tmp_path, 0, torch.device("cpu")).sampler
-    held = held_transitions(sampler, 5, 0.9)
-    assert float(held.rewards[1]) == pytest.approx(0.9) and float(held.alive[1]) == 0
-    torch.testing.assert_close(held.actions[1], sampler.actions[1:3].mean(0))
-
-
-def test_each_phase_moves_the_policy_that_it_is_for(tmp_path, monkeypatch):
-    monkeypatch.setattr("velap.config.training.DISTIL_STEPS", 100)
-    run = make(tmp_path, own())
-    members = until(run, "held")
-    for stage, changed in (("held", set()), ("held distil", {"held_policy"}), ("clone", {"success_policy"})):
-        before = weights(run.model)
-        while run.step < run.total and (run.phase == stage or not moved(before, run.model)):
-            run.update()
-            if run.phase == stage:
-                assert moved(before, run.model) <= changed, stage
-            else:
-                before = weights(run.model) if stage == "held" else before
-                break
-    taught = members.act(run.frozen.latents.expand(3, -1, -1)).detach()
-    apart = float((taught[0] - taught[1]).abs().mean())
-    assert float((run.model.held_policy(run.frozen.latents).detach() - taught).abs().mean()) < apart, "between them, or near"
-
-
-def test_policies_of_held_members_learn_at_every_update(tmp_path):
-    run = make(tmp_path, own(policy_every=2))
-    members = until(run, "held")
-    for _ in range(3):
-        before = weights(members.policies)
-        run.update()
-        assert moved(before, members.policies)
-
-
-def test_held_members_learn_from_held_transitions(tmp_path):
-    run = make(tmp_path, own())
-    members = until(run, "held")
-    latents, rows = run.frozen.latents, members.draw(3)
-    loss = members.value_loss(rows)[0]
-    held = held_transitions(run.sampler, 3, run.config.train.discount)
-    then = latents[held.following[rows]]
-    worth = members.qs(members.target, then, members.act(then)).amin(1) * run.config.train.discount
-    goal = (held.rewards[rows] + held.alive[rows] * worth).detach()
-    q = members.qs(members.critics, latents[rows], held.actions[rows])
-    assert loss.item() == pytest.approx((q - goal.unsqueeze(1)).square().mean().item(), rel=1e-4)
-
-
-@pytest.mark.parametrize("stop", [3, 9, 15, 19])
-def test_a_training_of_own_policies_resumes_to_the_same_bits(tmp_path, stop):
-    straight_and_resumed(tmp_path, own(ensemble=MANY), stop)
-
-
-def test_settings_without_their_policy_are_refused():
-    for name in ("success_exponent", "success_rollout"):
-        with pytest.raises(ConfigError, match=rf"{name}.*without a clone phase"):
-            override(config(), controller={name: 3})
-    with pytest.raises(ConfigError, match="stop_exponent"):
-        override(own(), controller={"success_exponent": 30.0})
-    for fields in ({"members": 0}, {"hold": 0}, {"noise": -1.0}):
+def test_settings_out_of_range_are_refused():
+    for fields in ({"members": 0}, {"noise": -1.0}):
         with pytest.raises(ConfigError, match=next(iter(fields))):
             several(ensemble={**MANY, **fields})

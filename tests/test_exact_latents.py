@@ -63,8 +63,7 @@ def test_mazes_tell_no_state():
 def test_the_study_learns_and_plays(tmp_path, monkeypatch, task):
     quick = {"model": {"bank_size": 10}, "planner": {"n_iter": 20},
              "train": {"latent": {"steps": 2, "horizon": 3}, "values": {"steps": 2}, "clone": {"steps": 0},
-                       "ensemble": {"steps": 2, "members": 2}, "held": {"steps": 2, "members": 2}},
-             "controller": {"success_rollout": 0, "success_exponent": 0.0}}
+                       "ensemble": {"steps": 2, "members": 2}}}
     monkeypatch.setattr("velap.config.training.DISTIL_STEPS", 2)
     rows = study_exact_latents(Console(quiet=True), task, quick, quick=True, path=tmp_path / "x.json", contexts=3)
     assert [row["method"] for row in rows] == ["td3bc", "velap"] and {row["episodes"] for row in rows} == {10}

@@ -58,13 +58,14 @@ def actions_of(agent: TreeAgent, seeds: tuple[int, ...],
 
 @pytest.mark.parametrize("provenance", [False, True], ids=["algorithm-2", "provenance"])
 def test_every_episode_takes_the_same_actions_in_any_batch(provenance: bool) -> None:
-    """π^g walks in the upper half of the world, the clone in the lower one."""
+    """π^g walks on the left of the wall, the clone on the right, and g is trusted little."""
     config = override(toy_config(n_iter=40, provenance=provenance), controller={"n_replan": 5})
     kind = ProvenanceAgent if provenance else VelapAgent
 
     def agent() -> TreeAgent:
-        model = ToyModel(act_global=lambda z: (z[..., 1:] > 0) * straight_to_goal(z),
-                         act_success=lambda z: (z[..., 1:] <= 0) * straight_to_goal(z))
+        model = ToyModel(act_global=lambda z: (z[..., :1] < 0) * straight_to_goal(z),
+                         act_success=lambda z: (z[..., :1] >= 0) * straight_to_goal(z))
+        model.missed.fill_(0.8)
         return kind(model, config)  # type: ignore[arg-type]
 
     acted: set[Actor] = set()

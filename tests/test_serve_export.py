@@ -30,7 +30,7 @@ LOW, HIGH = (-1.0, 0.0, 2.0), (1.0, 4.0, 2.5)
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights of every policy there is, three frames a state, a memory of past commands."""
     model = {"encoder": "tiny", "frame_stack": STACK, "latent_dim": 5, "bank_size": 8, "command_dims": 3}
-    config = override(Config(task="toy", preset="default"), model=model, train={"clone": {"steps": 1}, "held": {"steps": 1}})
+    config = override(Config(task="toy", preset="default"), model=model, train={"clone": {"steps": 1}})
     torch.manual_seed(0)
     network = make_model(config, Spaces(SIDE, SIDE, LOW, HIGH))
     path = tmp_path_factory.mktemp("run") / "model.safetensors"
@@ -48,7 +48,7 @@ def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 def test_programs_are_the_model(checkpoint: Path, exported: Path) -> None:
     model, _, _ = load_checkpoint(checkpoint)
     programs = {name: torch.export.load(exported / f"{name}.pt2").module()
-                for name in ("encode", "act_global", "act_local", "success_policy", "held_policy")}
+                for name in ("encode", "act_global", "act_local", "success_policy")}
     assert {path.name for path in exported.iterdir()} == {f"{name}.pt2" for name in programs} | {"export.json"}
     for batch in (1, 7):
         frames = torch.randint(0, 256, (batch, STACK, SIDE, SIDE, 3), dtype=torch.uint8)
@@ -58,8 +58,7 @@ def test_programs_are_the_model(checkpoint: Path, exported: Path) -> None:
             torch.testing.assert_close(programs["encode"](frames, commands), latent, atol=1e-4, rtol=0)
             goal = latent.flip(0)
             torch.testing.assert_close(programs["act_local"](latent, goal), model.act_local(latent, goal))
-            for name, policy in (("act_global", model.act_global), ("success_policy", model.success_policy),
-                                 ("held_policy", model.held_policy)):
+            for name, policy in (("act_global", model.act_global), ("success_policy", model.success_policy)):
                 assert policy is not None
                 torch.testing.assert_close(programs[name](latent), policy(latent))
 
