@@ -18,10 +18,9 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from velap.config.migrate_v1 import legacy_json, to_v1
 
 from velap import api
-from velap.config import Config, ModelConfig, legacy_hash, override
+from velap.config import Config, ModelConfig, override
 from velap.data.frames import FrameStore
 from velap.data.sampling import WholeWindows
 from velap.errors import CheckpointError
@@ -46,7 +45,7 @@ from velap.training.phase import start_heads_afresh
 REPOSITORY = Path(__file__).resolve().parents[1]
 HEADED = tuple(learning_methods())
 """Methods that act by a head of their own."""
-ALL_METHODS = tuple(name for name in METHODS if name != "velap-provenance")
+ALL_METHODS = tuple(METHODS)
 """Methods that were there at the commit of the golden files."""
 HEAD_SEEDS = {"bc": 7, "bc-success": 8, "iql": 9, "iql-sparse": 10, "iris": 11, "iris-multistep": 12}
 """Seeds of the random weights of the heads in the traces, and of their learners."""
@@ -131,7 +130,7 @@ def _random_head(method: str, config: Config, action_dim: int) -> Any:
 
 TINY: dict[str, Any] = {"frame_stack": 2, "latent_dim": 4, "bank_size": 10}
 BRIEF: dict[str, Any] = {"joint": {"steps": 2, "windows": 6, "window": 5}, "latent": {"steps": 0}}
-OWN: dict[str, Any] = {"clones": True, "holds": True}
+OWN: dict[str, Any] = {"clones": True}
 BEST: dict[str, Any] = {"critic_loss": "cross_entropy", "critic_floor": 0.02}
 SMALL_SIZES: dict[str, Any] = {
     "velap.config.training.DISTIL_STEPS": UPDATES,
@@ -155,6 +154,7 @@ SMALL_SIZES: dict[str, Any] = {
     "velap.models.velap.POLICY": (16,),
     "velap.training.encoder.SIDE": 16,
     "velap.training.ensemble.CRITIC": (16,),
+    "velap.training.ensemble.HORIZON": 3,
     "velap.training.ensemble.POLICY": (16,),
     "velap.training.joint.WholeWindows": lambda windows, length, *_: WholeWindows(windows, length, 12, 10, 3),
 }
@@ -202,7 +202,6 @@ def small_sizes(**changes: Any) -> Iterator[None]:
 
 
 ENSEMBLE: dict[str, Any] = {"steps": 2, "members": 3}
-HELD: dict[str, Any] = {"steps": 2, "members": 3, "hold": 5}
 PAIRS: dict[str, Any] = {"steps": UPDATES, "pairs": 8}
 
 PHASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
@@ -225,19 +224,16 @@ PHASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "members": ("ensemble", {}, {"ensemble": {**ENSEMBLE, "steps": UPDATES, "noise": 0.1}}),
     "members-cross-entropy": ("ensemble", {}, {"ensemble": {**ENSEMBLE, "steps": UPDATES}, **BEST}),
     "distil": ("ensemble distil", {}, {"ensemble": ENSEMBLE}),
-    "held": ("held", OWN, {"held": {**HELD, "steps": UPDATES}}),
-    "held_distil": ("held distil", OWN, {"held": HELD}),
     "clone": ("clone", OWN, {"clone": {"steps": UPDATES}}),
-    "clone-candidates": ("clone", OWN, {"clone": {"steps": UPDATES, "candidates": 2, "reach": 3}}),
+    "clone-candidates": ("clone", OWN, {"clone": {"steps": UPDATES, "candidates": 2}}),
     "clone-after-everything": ("clone", OWN, {
         "encoder": {**PAIRS, "steps": 2}, "latent": {"steps": 2, "horizon": 3}, "values": {"steps": 2}, "ensemble": ENSEMBLE,
-        "held": HELD, "clone": {"steps": UPDATES, "reach": 3}}),
+        "clone": {"steps": UPDATES}}),
 }
 """Cases of the joint training: the stage whose updates are recorded, and the fields of the model and of the training that
-differ from `TINY` and `BRIEF`; with `OWN`, the model has both policies of VELAP's own, whatever the phases."""
+differ from `TINY` and `BRIEF`; with `OWN`, the model has the policy of successes, whatever the phases."""
 NAMES = {"ensemble/loss": "members/loss", "ensemble/q": "members/q", "ensemble/policy": "members/policy",
-         "ensemble/imitation": "members/imitation", "ensemble/distil": "distil/policy", "ensemble/distil_q": "distil/q",
-         "held/distil": "held_distil/policy"}
+         "ensemble/imitation": "members/imitation", "ensemble/distil": "distil/policy", "ensemble/distil_q": "distil/q"}
 """Losses that have another name in the golden files."""
 
 
@@ -321,8 +317,6 @@ def checkpoint_facts(task: str) -> dict[str, Any]:
     """What a released checkpoint is, as it is loaded: hashes, the whole config, provenance that decides records."""
     model, config, metadata = load_checkpoint(released(task))
     return {
-        "config_hash": legacy_hash(config),
-        "method_hashes": {name: get_method(name).legacy_hash(config) for name in ALL_METHODS if name not in HEADED},
         "weights_sha256": metadata["weights_sha256"],
         "shared_sha256": shared_weights(metadata),
         "tensors_sha256": tensors_digest(released(task)),
@@ -333,14 +327,23 @@ def checkpoint_facts(task: str) -> dict[str, Any]:
         "dataset_id": metadata["dataset_id"],
         "dataset_hash": metadata["dataset_hash"],
         "spaces": json.loads(metadata["spaces"]),
-        "config": config_fields(config),
+        "encoder": config.model.encoder,
+        "frame_stack": config.model.frame_stack,
+        "phases": {phase.label: phase.steps for phase in config.train.phases},
     }
 
 
 def hashes_of_content(task: str) -> tuple[str, str]:
     """`weights_sha256` computed anew from the file's tensors and config, and what its metadata says."""
     tensors, metadata = load_tensors(released(task))
-    return content_sha256(tensors, {"config": legacy_json(Config.from_json(metadata["config"]))}), metadata["weights_sha256"]
+    return content_sha256(tensors, {"config": metadata["config"]}), metadata["weights_sha256"]
+
+
+def tensors_that_went(task: str) -> int:
+    """Numbers in the tensors of a released checkpoint that today's model has no more, less those that it has besides."""
+    there, own = load_tensors(released(task))[0], load_checkpoint(released(task))[0].state_dict()
+    return (sum(value.numel() for name, value in there.items() if name not in own)
+            - sum(value.numel() for name, value in own.items() if name not in there))
 
 
 def tensors_digest(path: Path) -> str:
@@ -349,18 +352,6 @@ def tensors_digest(path: Path) -> str:
     single = sorted(hashlib.sha256(f"{tuple(value.shape)}".encode() + value.double().numpy().tobytes()).hexdigest()
                     for value in tensors.values())
     return hashlib.sha256("".join(single).encode()).hexdigest()
-
-
-def todays_config(task: str) -> dict[str, Any]:
-    """All fields of the default preset of a task."""
-    return config_fields(make_config(task, "default"))
-
-
-def config_fields(config: Config) -> dict[str, Any]:
-    """Every field of a config by its name in the golden files, as velap 0.1 had them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("velap.config.migrate_v1._refuse_unless", lambda *_: None)  # sizes are those of the tests
-        return json.loads(json.dumps({"task": config.task, "preset": config.preset, **to_v1(config)}))
 
 
 def record_identities(task: str, method: str) -> set[tuple[str, str]]:
@@ -379,7 +370,7 @@ OLD_STOP = 14
 def old_config() -> Config:
     """A tiny run of the task `OLD_TASK` with most phases."""
     training = {"joint": {"steps": 4, "windows": 6, "window": 5, "c1": 0.01}, "latent": {"steps": 2, "horizon": 3},
-                "values": {"steps": 2}, "ensemble": ENSEMBLE, "held": HELD, "clone": {"steps": 4, "reach": 3},
+                "values": {"steps": 2}, "ensemble": ENSEMBLE, "clone": {"steps": 4},
                 "checkpoint_every": 8, "log_every": 2}
     return override(make_config(OLD_TASK), model=TINY, train=training, planner={"n_iter": 8, "candidates": 4, "n_sim": 2})
 
@@ -388,7 +379,7 @@ def old_config() -> Config:
 def old_sizes() -> Iterator[None]:
     """Within, networks have the sizes of that run, and its config is read although it names them."""
     with small_sizes(STRIDES=(4, 2), DISTIL_STEPS=2), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("velap.config.migrate_v1._refuse_unless", lambda *_: None)
+        patch.setattr("velap.config.migrate._refuse_unless", lambda *_: None)
         yield
 
 
@@ -446,13 +437,13 @@ def evaluate_old(checkpoint: Path, records: Path, method: str, episodes: int = 2
     return record_path(records, OLD_TASK, method, "default", 0)
 
 
-def load_old(checkpoint: Path, method: str) -> tuple[LatentModel, dict[str, Any]]:
-    """The model and all fields of the config of a finished old checkpoint; a method with a head has that one beside it."""
+def load_old(checkpoint: Path, method: str) -> tuple[LatentModel, Config]:
+    """The model and the config of a finished old checkpoint; a method with a head has that one beside it."""
     with old_sizes():
         model, config, metadata = load_checkpoint(checkpoint)
         if method in HEADED:
             load_head(checkpoint.with_name(f"{method}.safetensors"), metadata)
-        return model, config_fields(config)
+        return model, config
 
 
 def read_old_records(path: Path) -> list[dict[str, Any]]:

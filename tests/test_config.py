@@ -63,7 +63,8 @@ def test_what_is_ours_is_off_in_the_paper_preset() -> None:
     assert config.controller == ControllerConfig(n_replan=25, lookahead=0, lookahead_gain=1.0)
     assert not config.planner.provenance and not config.planner.coherent_noise
     assert (config.planner.anchor, config.planner.expansion_weight) == ("none", 0)
-    assert (config.planner.p_sparse, config.planner.p_value, config.planner.p_policy, config.planner.candidates) == (0.4, 0.4, 0.2, 50)
+    planner = config.planner
+    assert (planner.p_sparse, planner.p_value, planner.p_policy, planner.candidates) == (0.4, 0.4, 0.2, 50)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: f"{config.task}-{config.preset}")
@@ -111,7 +112,7 @@ def test_the_hash_is_of_every_field_that_decides_a_result() -> None:
     base = make_config("DrawerButton")
     others = neighbours(base)
     cadences = {f"train.{name}" for name in CADENCES}
-    assert len(others) > 50 and cadences <= set(others)
+    assert len(others) > 45 and cadences <= set(others)
     hashes = {name: config.hash() for name, config in others.items()}
     assert {name for name, value in hashes.items() if value == base.hash()} == cadences
     assert len(set(hashes.values())) == len(hashes) - len(cadences) + 1
@@ -147,7 +148,7 @@ def test_every_field_says_what_it_is_and_where_it_comes_from() -> None:
             meaning = docs(cls)[name]
             assert any(word in meaning for word in ("Table", "Eq.", "App.", "ours", "learnt, in this order")), (cls, name)
     described = {name for name, *_ in describe(make_config("SpiralMaze"))}
-    assert {"model.encoder", "train.joint.c1", "train.clone.candidates", "planner.p_sparse", "controller.n_replan"} <= described
+    assert {"model.encoder", "train.joint.c1", "train.clone.steps", "planner.p_sparse", "controller.n_replan"} <= described
     assert all(all(row) for row in describe(make_config("SpiralMaze")))
 
 

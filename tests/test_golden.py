@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import golden_access as velap
+from velap.config import ControllerConfig, PlannerConfig
 
 GOLDEN = Path(__file__).parent / "golden"
 ACTION = 1e-4
@@ -24,6 +25,9 @@ def read(name: str) -> dict[str, Any]:
 
 
 TRACES, LOSSES, CHECKPOINTS = read("traces"), read("losses"), read("checkpoints")
+PHASES_THEN = {"encoder": "encoder", "joint": "joint", "latent": "latent", "values": "latent_value", "ensemble": "member",
+               "clone": "clone"}
+"""Phases, and what their updates were called in the config of then."""
 every_task = pytest.mark.parametrize("task", CHECKPOINTS)
 
 
@@ -62,12 +66,15 @@ def test_losses_are_as_before(case: str, tmp_path: Path) -> None:
 
 @every_task
 def test_released_checkpoints_are_what_they_were(task: str) -> None:
-    assert velap.checkpoint_facts(task) == CHECKPOINTS[task]
-
-
-@every_task
-def test_the_config_of_a_released_checkpoint_is_todays(task: str) -> None:
-    assert velap.todays_config(task) == CHECKPOINTS[task]["config"]
+    facts, kept = velap.checkpoint_facts(task), CHECKPOINTS[task]
+    then = kept["config"]
+    assert facts.pop("frame_stack") == then["model"]["frame_stack"]
+    encoders = {(0, False): "conv", (24, False): "slow-moments", (24, True): "moments"}
+    assert facts.pop("encoder") == encoders[then["model"]["moment_colours"], then["model"]["keep_moments"]]
+    steps = {label: then["train"][f"{name}_steps"] for label, name in PHASES_THEN.items()}
+    assert facts.pop("phases") == {label: count for label, count in steps.items() if count}
+    facts["parameters"] += velap.tensors_that_went(task)
+    assert facts == {name: kept[name] for name in facts}
 
 
 @every_task
@@ -89,9 +96,11 @@ def test_a_run_of_several_phases_comes_to_the_weights_that_it_came_to(tmp_path: 
     with velap.pytorch_networks():
         found = velap.read_tensors(velap.train_old(tmp_path) / "model.safetensors")
     expected = velap.read_tensors(GOLDEN / "old/finished/model.safetensors")
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_allclose(found[name], values, rtol=1e-3, atol=1e-4, err_msg=name)
+    assert found.keys() - expected.keys() == {"missed", "bank_gap"}
+    shared = [name for name in expected if not name.startswith(("held_policy.", "success_policy."))]
+    assert len(shared) > 50
+    for name in shared:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-3, atol=1e-4, err_msg=name)
 
 
 def test_an_old_unfinished_run_is_refused_with_a_way_out_and_left_alone(tmp_path: Path) -> None:
@@ -107,6 +116,7 @@ def test_an_old_finished_run_is_read_with_its_head_and_records() -> None:
     for method in ("velap", "bc"):
         model, config = velap.load_old(old / "finished/model.safetensors", method)
         assert sum(value.numel() for value in model.state_dict().values()) > 1000
-        assert config == velap.config_fields(velap.old_config())
+        assert (config.planner, config.controller) == (PlannerConfig(), ControllerConfig())
+        assert config.train == velap.old_config().train
         records = velap.read_old_records(old / f"records/SpiralMaze/{method}-default/train0.jsonl")
         assert [(record["method"], record["episode_seed"]) for record in records] == [(method, 1000), (method, 1001)]

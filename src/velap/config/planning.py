@@ -42,7 +42,7 @@ class PlannerConfig:
     p_value: float = 0.1
     """p^value of the node sampling mixture; the rest is uniform. ours; 0.4 in `paper`."""
     p_policy: float = 0.2
-    """p^policy: probability that an expansion acts by π^g instead of g. ours: the paper gives no number. No effect with
+    """p^policy: probability that an expansion acts by π^g instead of g. ours: Table 8 leaves it out. No effect with
     `provenance`, where the policies have half of a round."""
     expansion_weight: float = 1.0
     """Each expansion made from a node counts as this many neighbours in Eq. 6, so that explored surroundings are left alone.
