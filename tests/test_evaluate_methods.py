@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def make_run(folder: Path, seed: int = 0) -> Path:
     """A joint checkpoint with random weights and a BC and an IRIS head beside it."""
     config = override(make_config("SpiralMaze"), planner={"n_iter": 4, "candidates": 2},
-                      model={"bank_size": 0, "frame_stack": 1})
+                      model={"bank_size": 8, "frame_stack": 1})
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = LatentModel(config.model, Spaces(64, 64, (-1.0,) * 2, (1.0,) * 2), config.train.discount)

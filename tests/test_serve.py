@@ -45,7 +45,7 @@ LOW, HIGH = (-1.0, 0.0, 2.0), (1.0, 4.0, 2.5)
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights, three frames of 16 pixels a state, a plan every four steps, a memory of past commands."""
-    model = {"frame_stack": STACK, "latent_dim": 5, "bank_size": 0, "command_dims": 3}
+    model = {"frame_stack": STACK, "latent_dim": 5, "bank_size": 8, "command_dims": 3}
     config = override(Config(task="toy", preset="default"), model=model, controller={"n_replan": 4},
                       planner={"n_iter": 12, "candidates": 4, "n_sim": 2, "discard_low_exponent": 1e4,
                                "discard_high_exponent": 1e-6})

@@ -86,7 +86,7 @@ def spiral_maze(task: str) -> Config:
 
 
 def obstacle_maze(task: str) -> Config:
-    """Many scenes: the encoder first learns where things are, and h, which errs at corners of new scenes, is corrected."""
+    """Many scenes: the encoder first learns where things are."""
     return Config(
         task, "default",
         ModelConfig(frame_stack=1, bank_size=4096),
@@ -98,8 +98,8 @@ def obstacle_maze(task: str) -> Config:
 
 
 def window_close(task: str) -> Config:
-    """Places come from colour moments, the hand's speed from past commands, all else is learnt on frozen latents. The median
-    of five policies leads; the tree takes over where the hand is stuck, which a high price of revisits says soon."""
+    """Places come from colour moments, the hand's speed from past commands, all else is learnt on frozen latents. π^g is
+    the median of five policies."""
     return Config(
         task, "default",
         ModelConfig(encoder="slow-moments", command_dims=3),
@@ -112,7 +112,7 @@ def window_close(task: str) -> Config:
 
 def faucet_close(task: str) -> Config:
     """A short joint phase of small windows tells a pretrained encoder what counts. The best of eight policies cloned from
-    successes leads wherever it gets to the goal by the model."""
+    successes proposes edges."""
     return Config(
         task, "default",
         ModelConfig(),
@@ -125,7 +125,7 @@ def faucet_close(task: str) -> Config:
 
 def button_wall(task: str) -> Config:
     """As WindowClose, but the latent keeps all moments, far values count as much as near ones, and noise keeps π^g from
-    learning single moments. The tree is the last resort: h errs by most of a step in such latents."""
+    learning single moments."""
     return Config(
         task, "default",
         ModelConfig(encoder="moments", command_dims=3),
@@ -137,8 +137,7 @@ def button_wall(task: str) -> Config:
 
 
 def drawer_button(task: str) -> Config:
-    """As ButtonWall with two subtasks: less imitation; far from the goal held actions and π^g in turns, near it what
-    worked."""
+    """As ButtonWall with two subtasks: less imitation, and a clone of the successes."""
     return Config(
         task, "default",
         ModelConfig(encoder="moments", command_dims=3),
