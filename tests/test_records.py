@@ -120,7 +120,8 @@ def test_records_of_another_run_are_not_mixed(tmp_path: Path, field: str, value:
     path = tmp_path / "r.jsonl"
     old = filled(path, 2)
     other = dataclasses.replace(KEY, **{field: value})
-    with pytest.raises(RecordError, match=rf"`{field}` is .* there and {re.escape(repr(value))} here\..* Give --fresh") as told:
+    expected = rf"`{field}` is .* there and {re.escape(repr(value))} here\..* Give --fresh"
+    with pytest.raises(RecordError, match=expected) as told:
         RecordFile(path, other)
     assert ("count as another method's" in str(told.value)) == (field == "config_hash")
     for number in (1, 2):
