@@ -85,7 +85,7 @@ def at(name: str, damage: Damage) -> Damage:
 
 def strangers(edit: Callable[[h5py.File, dict[str, Any]], object] = lambda file, metadata: None,
               damage: Damage = lambda path: None) -> Damage:
-    """Edit episodes and metadata and drop velap's checksums, as in someone else's dataset; then damage the episodes' file."""
+    """Edit episodes and metadata, drop velap's checksums, as in someone else's dataset, and damage the episodes' file."""
 
     def spoil(place: Path) -> None:
         metadata = json.loads((place / METADATA).read_bytes())
