@@ -1,6 +1,6 @@
-"""What pictures of a latent space consist of: real states, the 2-D Isomap, a plan and its tree; and the picture of one plan.
+"""What pictures consist of: real states, the 2-D Isomap, a plan and its tree, film strips; and the picture of one plan.
 
-P real states, D latent dimensions, L waypoints, M nodes of a tree, S frame size [px].
+P real states, D latent dimensions, L waypoints, M nodes of a tree, S frame size [px], F frames of a strip.
 """
 
 from __future__ import annotations
@@ -31,6 +31,10 @@ PROBES = 1200
 NEIGHBOURS = 5
 """Fewest neighbours of the Isomap graph. ours; more only where the graph would fall apart: in SpiralMaze, further ones are
 across a wall."""
+COLUMNS = 10
+"""Frames of a strip side by side."""
+MOST_FRAMES = 30
+"""Frames of a strip in all; of longer chains some are left out."""
 SMALLEST_SHOWN = 1e-3
 """Lower end of the logarithmic colours [Q-value]. ours: γ^169."""
 
@@ -198,6 +202,34 @@ def draw_path(axes: Any, path: NDArray[np.floating[Any]], label: str, start: str
     """A planned path [L, 2] from its start."""
     axes.plot(*path.T, "o-", color="tab:red", markersize=4, linewidth=2, label=label)
     axes.plot(*path[0], "*", color="black", markersize=13, label=start)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmStrip:
+    """Frames in a row, each with a caption."""
+
+    title: str
+    frames: NDArray[np.uint8]
+    """[F, H, W, 3]."""
+    captions: tuple[str, ...]
+    """[F]."""
+
+
+def strip_figure(path: Path, strip: FilmStrip) -> None:
+    """Frames in reading order with their captions below."""
+    picked = np.unique(np.linspace(0, len(strip.frames) - 1, min(MOST_FRAMES, len(strip.frames))).astype(int))
+    rows = -(-len(picked) // COLUMNS)
+    columns = min(COLUMNS, max(len(picked), 6))  # a title needs room
+    figure = new_figure(1.5 * columns, 2.05 * rows + 0.5, strip.title)
+    cells = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axes in cells:
+        axes.set_axis_off()
+    for axes, number in zip(cells, picked, strict=False):
+        axes.set_axis_on()
+        axes.imshow(strip.frames[number], interpolation="nearest")
+        axes.set(xticks=[], yticks=[])
+        axes.set_xlabel(strip.captions[number], fontsize=9)
+    save_figure(figure, path)
 
 
 def new_figure(width: float, height: float, title: str) -> Any:

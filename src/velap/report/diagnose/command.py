@@ -37,7 +37,7 @@ from velap.report.diagnose.model import (
 from velap.report.diagnose.plans import Starts, Trees, diagnose_trees
 from velap.report.diagnose.text import checks, page
 from velap.report.diagnose.world import Scene, expert_curves, first_states, has_layout, look_at_scene
-from velap.report.figures import RealStates, can_probe, probe
+from velap.report.figures import RealStates, can_probe, probe, strip_figure
 from velap.runs import only_writer, write_atomic
 from velap.tasks import TASKS, get_task, task_of
 from velap.training.diagnostics import horizons
@@ -278,9 +278,9 @@ def _draw(diagnosis: Diagnosis, out: Path) -> list[str]:
         shown["values.png"] = lambda path: figures.values_figure(path, diagnosis.curves)
     if diagnosis.scenes:
         shown["scenes.png"] = lambda path: figures.scenes_figure(path, diagnosis.scenes)
-    shown["plan.png"] = lambda path: figures.strip_figure(path, diagnosis.trees.strip)
+    shown["plan.png"] = lambda path: strip_figure(path, diagnosis.trees.strip)
     if (failures := diagnosis.failures) is not None:
-        shown["failure.png"] = lambda path: figures.strip_figure(path, failures.strip)
+        shown["failure.png"] = lambda path: strip_figure(path, failures.strip)
     for name, draw in shown.items():
         draw(out / name)
     return list(shown)

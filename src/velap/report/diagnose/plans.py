@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from velap.config import Config
 from velap.models.horizon import q_from_steps
 from velap.models.velap import LatentModel
-from velap.report.figures import RealStates, planned
+from velap.report.figures import FilmStrip, RealStates, planned
 from velap.search.est import plan
 from velap.search.types import Plan
 
@@ -49,17 +49,6 @@ class TreeNumbers:
     """[steps]"""
     distance: float
     """Mean distance of the nodes to the nearest real state [one-step lengths]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilmStrip:
-    """A chain of latents as the real frames nearest to them."""
-
-    title: str
-    frames: NDArray[np.uint8]
-    """[L, H, W, 3]."""
-    captions: tuple[str, ...]
-    """[L]."""
 
 
 @dataclass(frozen=True, kw_only=True)
