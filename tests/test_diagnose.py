@@ -32,7 +32,6 @@ from velap.report.diagnose import failures, text
 from velap.report.diagnose.failures import CLASSES, REMEDIES, Trace, classify, judge, watch
 from velap.report.diagnose.model import (
     LED,
-    RealStates,
     Recorded,
     StatePairs,
     ValueCurve,
@@ -46,6 +45,7 @@ from velap.report.diagnose.model import (
 )
 from velap.report.diagnose.plans import Starts, plan_strip, tree_numbers
 from velap.report.diagnose.world import distances_to, look_at_scene, stack_all
+from velap.report.figures import RealStates
 from velap.search.est import plan
 from velap.training.diagnostics import horizons
 
@@ -197,14 +197,14 @@ def test_rank_correlation_and_values_along_an_episode() -> None:
 def test_an_album_finds_the_nearest_real_state_and_holds_none_that_is_looked_at() -> None:
     recorded, model = line_recorded([0]), LineModel()
     real_states = real_states_of(model, recorded, np.random.default_rng(0), 1000)  # type: ignore[arg-type]
-    frames, distances = real_states.nearest(torch.tensor([[60.4], [3.0]]))
-    assert frames[:, 0, 0, 0].tolist() == [60, 20]
+    numbers, distances = real_states.nearest(np.array([[60.4], [3.0]]))
+    assert real_states.frames[numbers, 0, 0, 0].tolist() == [60, 20]
     np.testing.assert_allclose(distances, [0.4, 17], atol=1e-4)
     assert encode_states(model, recorded.sampler, np.array([0, 25])).tolist() == [[0.0], [24.0]]  # type: ignore[arg-type]
     assert RealStates(
         source="x",
-        latents=torch.tensor([[0.0], [1.0], [5.0]]),
-        frames=frames).spacing() == pytest.approx((1 + 1 + 4) / 3)
+        latents=np.array([[0.0], [1.0], [5.0]], np.float32),
+        frames=real_states.frames).spacing() == pytest.approx((1 + 1 + 4) / 3)
 
 
 def test_shortest_ways_between_points_of_a_maze() -> None:
@@ -262,16 +262,16 @@ def test_trees_in_numbers_and_as_a_strip() -> None:
     roots = torch.tensor([START, GOAL], dtype=torch.float64)
     config = toy_config().planner
     result = plan(toy_fns(), roots, config, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
-    grid = torch.cartesian_prod(torch.arange(-10.0, 11), torch.arange(-10.0, 11)).double()
+    grid = np.stack(np.meshgrid(np.arange(-10.0, 11), np.arange(-10.0, 11), indexing="ij"), -1).reshape(-1, 2)
     real_states = RealStates(
         source="a grid",
-        latents=grid,
-        frames=(grid.numpy()[:, None, None, :1] + 10).repeat(3, -1).astype(np.uint8))
+        latents=grid.astype(np.float32),
+        frames=(grid[:, None, None, :1] + 10).repeat(3, -1).astype(np.uint8))
     starts = Starts(("one", "two"), np.full((2, 1, 1, 1, 3), 77, np.uint8))
     first, second = tree_numbers(starts, result, real_states, 0.5)
     assert first.nodes - 1 + sum(first.rejected.values()) == config.n_iter
     nodes = result.tree.latents[0, : first.nodes]
-    assert first.distance == pytest.approx(float(torch.cdist(nodes, grid).amin(1).mean()) / 0.5)
+    assert first.distance == pytest.approx(float(torch.cdist(nodes, torch.tensor(grid)).amin(1).mean()) / 0.5)
     assert second.reached_goal and second.waypoints == 0 and second.start_value == pytest.approx(1)
     strip = plan_strip(starts, result, real_states, 0.5)
     assert len(strip.frames) == len(strip.captions) == first.waypoints + 1

@@ -124,7 +124,7 @@ def test_unreadable_files_are_found(base: Path, tmp_path: Path) -> None:
     shutil.copytree(base, place)
     assert unreadable(place) == leftovers(place) == []
     cases.flip(place / "run" / "model.safetensors")
-    cases.flip(cases.data_of(place) / "main_data.hdf5")
+    cases.flip(place / cases.EPISODES)
     (place / "run" / "metrics.jsonl").write_text('{"step": 1}\n{"st')
     (place / "shard.npz").write_bytes(b"PK")
     (place / "run" / ".state.safetensors.1.tmp").write_bytes(b"")

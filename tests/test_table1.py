@@ -207,6 +207,7 @@ def test_cells_show_intervals_of_one_seed_and_the_spread_of_several() -> None:
     assert cells["iql"] == "–", "missing, not guessed"
     text = " ".join(tables.to_markdown(results.of("default")).split())
     assert "87.5 ± 17.7 (2 seeds)<br>paper 94 ± 3" in text and "**IQL (0.9 / 10)** | –<br>paper –" in text
+    assert r"**BC (D\*)** |" in text, "the asterisk of a name is no mark of Markdown"
     costs = tables.planning(results.of("default")).loc["SpiralMaze"]
     assert tuple(costs)[:4] == ("2.0", "41.7", "30.0", "40.0"), "medians 20 and 40; 95th percentiles 30 and 50"
     rows = list(csv.DictReader(io.StringIO(tables.to_csv(results))))

@@ -17,7 +17,7 @@ from velap.evaluation.evaluate import Player
 from velap.evaluation.rollout import FrameReader
 from velap.models import checkpoint
 from velap.report import demo
-from velap.report.figures import LatentMap, can_probe, plan_figure, probe, to_pixels
+from velap.report.figures import LatentMap, can_probe, plan_figure, planned, probe, to_pixels
 from velap.report.video import CAPTION, HOLD, TILE, VideoRecorder, film
 from velap.search.est import plan
 
@@ -65,8 +65,7 @@ def test_the_picture_of_a_plan(tmp_path: Path) -> None:
     fns = ToyModel().search_fns()  # type: ignore[arg-type]
     roots = torch.tensor([GOAL, (-3.0, 0.0)], dtype=torch.float64)
     result = plan(fns, roots, player.config.planner, torch.Generator().manual_seed(0))
-    plan_figure(tmp_path / "plan.png", frame=np.full((8, 8, 3), 200, np.uint8), plan=result, row=1, latent_map=latent_map,
-                title="title")
+    plan_figure(tmp_path / "plan.png", planned(result, 1), np.full((8, 8, 3), 200, np.uint8), latent_map, "title")
     image = imageio.imread(tmp_path / "plan.png")
     assert image.shape[:2] == (550, 1650)
     assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 200

@@ -28,7 +28,8 @@ from velap.methods.base import make_agent
 from velap.methods.tree_agent import Actor
 from velap.methods.velap import VelapAgent
 from velap.report import viewer, viewer_page
-from velap.report.viewer import Backdrop, Subject, Trace, backdrop_of, subject_of, trace
+from velap.report.figures import RealStates
+from velap.report.viewer import Subject, Trace, backdrop_of, subject_of, trace
 from velap.report.viewer_page import GRID, LARGEST, MARK, episode_data, page
 from velap.search import est
 from velap.search import types as search
@@ -48,7 +49,7 @@ def seen(player: Player) -> Trace:
 
 
 @pytest.fixture(scope="module")
-def backdrop(player: Player) -> Backdrop:
+def backdrop(player: Player) -> RealStates:
     found = backdrop_of(player, SEED, count=200)
     assert found is not None
     return found
@@ -119,11 +120,19 @@ def test_another_method_shows_its_frames_alone(player: Player) -> None:
     assert data["trail"] == [] and data["values"] == [None] * len(found.steps)
 
 
+def test_a_world_that_draws_nothing_shows_what_the_agent_sees(player: Player, seen: Trace,
+                                                              monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(ToyEnv, "free_positions")
+    monkeypatch.setattr(ToyEnv, "render_mode", None)
+    for step, drawn in zip(trace(player, SEED).steps, seen.steps, strict=True):
+        np.testing.assert_array_equal(step.picture, drawn.picture)
+
+
 # real states
 
 
-def test_the_backdrop_shows_what_a_latent_looks_like(backdrop: Backdrop) -> None:
-    assert backdrop.source == "the episode's scene" and backdrop.frames is not None
+def test_the_backdrop_shows_what_a_latent_looks_like(backdrop: RealStates) -> None:
+    assert backdrop.source == "the episode's scene"
     wanted = np.array([GOAL, (-3.0, 2.0)], np.float32)
     found, away = backdrop.nearest(wanted)
     np.testing.assert_allclose(np.linalg.norm(backdrop.latents[found] - wanted, axis=1), away, rtol=1e-5)
@@ -140,7 +149,7 @@ def data_of(text: str) -> dict:
     return json.loads(found[1])
 
 
-def test_the_page_holds_the_episode(subject: Subject, seen: Trace, backdrop: Backdrop) -> None:
+def test_the_page_holds_the_episode(subject: Subject, seen: Trace, backdrop: RealStates) -> None:
     text = page(subject, seen, backdrop)
     assert MARK not in text and len(text.encode()) < LARGEST
     data = data_of(text)
@@ -157,14 +166,14 @@ def test_the_page_holds_the_episode(subject: Subject, seen: Trace, backdrop: Bac
     assert data["records"] == [{"seed": 3, "success": True, "steps": 21}, {"seed": 4, "success": False, "steps": 60}]
 
 
-def test_principal_components_of_a_plane_keep_its_distances(subject: Subject, seen: Trace, backdrop: Backdrop) -> None:
+def test_principal_components_of_a_plane_keep_its_distances(subject: Subject, seen: Trace, backdrop: RealStates) -> None:
     data = episode_data(subject, seen, backdrop, "pca")
     shown = np.array(data["backdrop"]["points"], float)
     drawn, true = (np.linalg.norm(np.diff(points, axis=0), axis=1) for points in (shown, backdrop.latents))
     np.testing.assert_allclose(drawn / drawn.mean(), true / true.mean(), atol=0.02)
 
 
-def test_only_what_belongs_to_the_page_is_named_in_it(subject: Subject, seen: Trace, backdrop: Backdrop) -> None:
+def test_only_what_belongs_to_the_page_is_named_in_it(subject: Subject, seen: Trace, backdrop: RealStates) -> None:
     text = page(subject, seen, backdrop)
     assert set(re.findall(r"\w+://[^\s\"'<>]+", text)) == {"http://www.w3.org/2000/svg"}  # a name, never fetched
     assert "default-src 'none'" in text
@@ -247,7 +256,7 @@ def test_what_a_browser_would_complain_about_is_noticed(site: Site) -> None:
 
 @needs_browser
 def test_a_browser_shows_the_episode_without_error_or_request(site: Site, subject: Subject, seen: Trace,
-                                                              backdrop: Backdrop) -> None:
+                                                              backdrop: RealStates) -> None:
     (site.folder / "page.html").write_text(page(subject, seen, backdrop), encoding="utf-8")
     middle = seen.plans[1].step + 2
     dom, console = browse(site, f"page.html#step={middle}", "--dump-dom")
@@ -285,7 +294,7 @@ def grey_pixels_of(path: Path) -> int:
 
 @needs_browser
 def test_the_tree_grows_and_the_chosen_path_comes_last(site: Site, subject: Subject, seen: Trace,
-                                                       backdrop: Backdrop) -> None:
+                                                       backdrop: RealStates) -> None:
     """Screenshots: no path while the tree is unfinished, a longer way behind the agent later on."""
     (site.folder / "page.html").write_text(page(subject, seen, backdrop), encoding="utf-8")
     shots = {}

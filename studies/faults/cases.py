@@ -17,14 +17,21 @@ from typing import Any, Protocol
 import h5py
 import numpy as np
 import torch
+from safetensors.torch import save_file
+
+from velap.runs import load_tensors, save_tensors
 
 DATASET = "velap/SpiralMaze-v0"
+MODEL, STATE = "run/model.safetensors", "run/state.safetensors"
+EPISODES, METADATA = (f"datasets/{DATASET}/data/{name}" for name in ("main_data.hdf5", "metadata.json"))
 TRAIN = ("train", "--dataset", DATASET, "--out", "new")
 RESUME = ("train", "SpiralMaze", "--out", "run", "--resume")
-EVALUATE = ("evaluate", "SpiralMaze", "--episodes", "1", "--checkpoint", "run/model.safetensors")
+EVALUATE = ("evaluate", "SpiralMaze", "--episodes", "1", "--checkpoint", MODEL)
 
 Answer = tuple[int, str]
 """Exit code and stderr of a command."""
+Damage = Callable[[Path], object]
+"""Changes a file, or a folder that holds copies of `datasets` and `run`."""
 
 
 class RunCommand(Protocol):
@@ -36,7 +43,6 @@ class RunCommand(Protocol):
         ...
 
 
-
 @dataclass(frozen=True)
 class Case:
     """One fault."""
@@ -45,8 +51,8 @@ class Case:
     arguments: tuple[str, ...]
     says: str
     """Text that the message has to hold."""
-    spoil: Callable[[Path], object] = lambda place: None
-    """Brings the fault about in a folder that holds copies of `datasets` and `run`."""
+    spoil: Damage = lambda place: None
+    """Brings the fault about in the case's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +64,6 @@ class CaseResult:
     message: str
     code: int
     problems: tuple[str, ...]
-
-
-def data_of(place: Path) -> Path:
-    """The dataset's files in a case's folder."""
-    return place / "datasets" / DATASET / "data"
 
 
 def cut(path: Path) -> None:
@@ -77,66 +78,64 @@ def flip(path: Path, share: float = 0.5) -> None:
     path.write_bytes(content)
 
 
-def as_stranger(place: Path, edit: Callable[[Any], object] = lambda file: None,
-                change: Callable[[dict[str, Any]], object] = lambda metadata: None) -> None:
-    """Edit the episodes (an `h5py.File`) and the metadata, and drop velap's checksums: now it is someone else's dataset."""
-    with h5py.File(data_of(place) / "main_data.hdf5", "r+") as file:
-        edit(file)
-    path = data_of(place) / "metadata.json"
-    metadata = json.loads(path.read_bytes())
-    del metadata["velap"]
-    change(metadata)
-    path.write_text(json.dumps(metadata))
+def at(name: str, damage: Damage) -> Damage:
+    """Damage of the file `name` of the folder."""
+    return lambda place: damage(place / name)
 
 
-def damaged_stranger(damage: Callable[[Path], object]) -> Callable[[Path], object]:
-    """Damage of a dataset without checksums of ours."""
+def strangers(edit: Callable[[h5py.File, dict[str, Any]], object] = lambda file, metadata: None,
+              damage: Damage = lambda path: None) -> Damage:
+    """Edit episodes and metadata, drop velap's checksums, as in someone else's dataset, and damage the episodes' file."""
 
     def spoil(place: Path) -> None:
-        as_stranger(place)
-        damage(data_of(place) / "main_data.hdf5")
+        metadata = json.loads((place / METADATA).read_bytes())
+        del metadata["velap"]
+        with h5py.File(place / EPISODES, "r+") as file:
+            edit(file, metadata)
+        (place / METADATA).write_text(json.dumps(metadata))
+        damage(place / EPISODES)
 
     return spoil
 
 
-def put(name: str, index: int, value: float) -> Callable[[Any], object]:
-    """An edit that sets one entry of an array of the third episode."""
-
-    def edit(file: Any) -> None:
-        file[f"episode_2/{name}"][index] = value
-
-    return edit
+def in_third_episode(name: str, value: float) -> Damage:
+    """A stranger's dataset with `value` in one step of the third episode's array `name`."""
+    return strangers(lambda file, metadata: file[f"episode_2/{name}"].__setitem__(1, value))
 
 
-def replace(name: str, make: Callable[[np.ndarray], np.ndarray]) -> Callable[[Any], object]:
-    """An edit that puts `make(array)` in the place of an array, in every episode."""
+def in_every_episode(name: str, make: Callable[[np.ndarray], np.ndarray], **changes: tuple[str, str]) -> Damage:
+    """A stranger's dataset with `make(array)` in place of every array `name`; `changes` replace text of the metadata."""
 
-    def edit(file: Any) -> None:
+    def edit(file: h5py.File, metadata: dict[str, Any]) -> None:
         for group in file.values():
             array = group[name][...]
             del group[name]
             group[name] = make(array)
+        for field, (old, new) in changes.items():
+            metadata[field] = metadata[field].replace(old, new)
 
-    return edit
+    return strangers(edit)
 
 
-def shorten(file: Any) -> None:
-    """An edit that leaves two steps of every episode, the last one of the first episode rewarded."""
+def _two_steps_each(file: h5py.File, metadata: dict[str, Any]) -> None:
+    """Leave two steps of every episode, the last one of the first episode rewarded."""
     for group in file.values():
         for name, count in (("observations", 3), ("actions", 2), ("rewards", 2), ("terminations", 2), ("truncations", 2)):
             group[name].resize(count, axis=0)
         group["truncations"][-1] = True
         group.attrs["total_steps"] = 2
     file["episode_0/rewards"][-1] = 1
+    metadata["total_steps"] = 2 * metadata["total_episodes"]
 
 
-def rewrite(path: Path, change: Callable[[dict[str, Any], dict[str, str]], object]) -> None:
-    """Write a checkpoint again, with a right checksum, after `change(tensors, metadata)`."""
-    from velap.runs import load_tensors, save_tensors
+def checkpoint(change: Callable[[dict[str, Any], dict[str, str]], object]) -> Damage:
+    """Write the checkpoint again, with a right checksum, after `change(tensors, metadata)`."""
+    def rewrite(path: Path) -> None:
+        tensors, metadata = load_tensors(path)
+        change(tensors, metadata)
+        save_tensors(path, tensors, metadata)
 
-    tensors, metadata = load_tensors(path)
-    change(tensors, metadata)
-    save_tensors(path, tensors, metadata)
+    return at(MODEL, rewrite)
 
 
 def _transpose_a_weight(tensors: dict[str, Any], metadata: dict[str, str]) -> None:
@@ -150,65 +149,50 @@ def _unknown_field(tensors: dict[str, Any], metadata: dict[str, str]) -> None:
     metadata["config"] = json.dumps(config)
 
 
-def _no_reward(file: Any) -> None:
-    for group in file.values():
-        group["rewards"][...] = 0
+def unfinished(damage: Damage = lambda path: None) -> Damage:
+    """Damage of the state of a training that did not reach its end."""
 
+    def spoil(place: Path) -> None:
+        (place / MODEL).unlink()
+        damage(place / STATE)
 
-def _model(place: Path) -> Path:
-    return place / "run" / "model.safetensors"
-
-
-def _state(place: Path) -> Path:
-    return place / "run" / "state.safetensors"
-
-
-def _unfinished(spoil: Callable[[Path], object]) -> Callable[[Path], object]:
-    def both(place: Path) -> None:
-        _model(place).unlink()
-        spoil(_state(place))
-
-    return both
+    return spoil
 
 
 CASES: tuple[Case, ...] = (
     Case("dataset missing", ("train", "--dataset", "robot/pile-v0"), "no Minari dataset 'robot/pile-v0'"),
-    Case("dataset truncated", TRAIN, "is damaged", lambda place: cut(data_of(place) / "main_data.hdf5")),
-    Case("dataset bit-flipped", TRAIN, "is damaged", lambda place: flip(data_of(place) / "main_data.hdf5")),
-    Case("dataset's metadata truncated", TRAIN, "is damaged", lambda place: cut(data_of(place) / "metadata.json")),
-    Case("stranger's dataset truncated", TRAIN, "is damaged", damaged_stranger(cut)),
-    Case("stranger's dataset bit-flipped", TRAIN, "is damaged", damaged_stranger(flip)),
-    Case("one image too few", TRAIN, "one more than",
-         lambda place: as_stranger(place, replace("observations", lambda images: images[:-1]))),
+    Case("dataset truncated", TRAIN, "is damaged", at(EPISODES, cut)),
+    Case("dataset bit-flipped", TRAIN, "is damaged", at(EPISODES, flip)),
+    Case("dataset's metadata truncated", TRAIN, "is damaged", at(METADATA, cut)),
+    Case("stranger's dataset truncated", TRAIN, "is damaged", strangers(damage=cut)),
+    Case("stranger's dataset bit-flipped", TRAIN, "is damaged", strangers(damage=flip)),
+    Case("one image too few", TRAIN, "one more than", in_every_episode("observations", lambda images: images[:-1])),
     Case("actions of another shape", TRAIN, "the actions have shape",
-         lambda place: as_stranger(place, replace("actions", lambda actions: actions[:, :1]))),
-    Case("an action is NaN", TRAIN, "expected finite numbers", lambda place: as_stranger(place, put("actions", 1, np.nan))),
-    Case("an action is infinite", TRAIN, "expected finite numbers",
-         lambda place: as_stranger(place, put("actions", 1, np.inf))),
-    Case("a reward is NaN", TRAIN, "expected finite numbers", lambda place: as_stranger(place, put("rewards", 1, np.nan))),
+         in_every_episode("actions", lambda actions: actions[:, :1])),
+    Case("an action is NaN", TRAIN, "expected finite numbers", in_third_episode("actions", np.nan)),
+    Case("an action is infinite", TRAIN, "expected finite numbers", in_third_episode("actions", np.inf)),
+    Case("a reward is NaN", TRAIN, "expected finite numbers", in_third_episode("rewards", np.nan)),
     Case("float images that do not fill their bounds", TRAIN, "expected values up to 255",
-         lambda place: as_stranger(place, replace("observations", lambda images: images.astype(np.float32) / 255),
-                                   lambda m: m.update(observation_space=m["observation_space"].replace("uint", "float")
-                                                      .replace("float8", "float32")))),
-    Case("no reward", TRAIN, "every reward of velap/SpiralMaze-v0 is 0", lambda place: as_stranger(place, _no_reward)),
-    Case("episodes shorter than k", TRAIN, "longest episode",
-         lambda place: as_stranger(place, shorten, lambda m: m.update(total_steps=2 * m["total_episodes"]))),
-    Case("checkpoint missing", EVALUATE, "no checkpoint at", lambda place: _model(place).unlink()),
-    Case("checkpoint truncated", EVALUATE, "damaged or truncated", lambda place: cut(_model(place))),
-    Case("checkpoint bit-flipped", EVALUATE, "does not match the SHA-256", lambda place: flip(_model(place))),
-    Case("checkpoint's header bit-flipped", EVALUATE, "run/model.safetensors", lambda place: flip(_model(place), 1e-4)),
+         in_every_episode("observations", lambda images: images.astype(np.float32) / 255,
+                          observation_space=("uint8", "float32"))),
+    Case("no reward", TRAIN, "every reward of velap/SpiralMaze-v0 is 0", in_every_episode("rewards", np.zeros_like)),
+    Case("episodes shorter than k", TRAIN, "longest episode", strangers(_two_steps_each)),
+    Case("checkpoint missing", EVALUATE, "no checkpoint at", at(MODEL, Path.unlink)),
+    Case("checkpoint truncated", EVALUATE, "damaged or truncated", at(MODEL, cut)),
+    Case("checkpoint bit-flipped", EVALUATE, "does not match the SHA-256", at(MODEL, flip)),
+    Case("checkpoint's header bit-flipped", EVALUATE, MODEL, at(MODEL, lambda path: flip(path, 1e-4))),
     Case("checkpoint is no safetensors file", EVALUATE, "not a readable safetensors file",
-         lambda place: _model(place).write_bytes(b"weights")),
+         at(MODEL, lambda path: path.write_bytes(b"weights"))),
     Case("checkpoint is a training state", EVALUATE, "not its training state",
-         lambda place: shutil.copy(_state(place), _model(place))),
+         lambda place: shutil.copy(place / STATE, place / MODEL)),
     Case("checkpoint with weights of another shape", EVALUATE, "does not fit its own config",
-         lambda place: rewrite(_model(place), _transpose_a_weight)),
-    Case("checkpoint with an unknown config field", EVALUATE, "unknown fields ['momentum']",
-         lambda place: rewrite(_model(place), _unknown_field)),
-    Case("checkpoint of someone else", EVALUATE, "carries no checksum", lambda place: _foreign(_model(place))),
-    Case("training state truncated", RESUME, "damaged or truncated", _unfinished(cut)),
-    Case("training state bit-flipped", RESUME, "does not match the SHA-256", _unfinished(flip)),
-    Case("training state of another seed", (*RESUME, "--seed", "7"), "another seed", _unfinished(lambda path: None)),
+         checkpoint(_transpose_a_weight)),
+    Case("checkpoint with an unknown config field", EVALUATE, "unknown fields ['momentum']", checkpoint(_unknown_field)),
+    Case("checkpoint of someone else", EVALUATE, "carries no checksum",
+         at(MODEL, lambda path: save_file({"weight": torch.zeros(3)}, str(path)))),
+    Case("training state truncated", RESUME, "damaged or truncated", unfinished(cut)),
+    Case("training state bit-flipped", RESUME, "does not match the SHA-256", unfinished(flip)),
+    Case("training state of another seed", (*RESUME, "--seed", "7"), "another seed", unfinished()),
     Case("run directory in use", ("train", "SpiralMaze", "--out", "run"), "--resume"),
     Case("dataset exists already", ("collect", "SpiralMaze"), "--overwrite"),
     Case("unknown task", ("train", "Nowhere"), "expected one of SpiralMaze"),
@@ -223,12 +207,6 @@ CASES: tuple[Case, ...] = (
     Case("config field of another type", (*TRAIN, "--set", "train.joint.window=x"), "expected int"),
     Case("unknown environment", ("evaluate", "x", "--method", "random", "--env", "NoSuch-v0"), "Gymnasium cannot make"),
 )
-
-
-def _foreign(path: Path) -> None:
-    from safetensors.torch import save_file
-
-    save_file({"weight": torch.zeros(3)}, str(path))
 
 
 def listing(folder: Path) -> dict[str, str]:
@@ -253,15 +231,10 @@ def check(case: Case, base: Path, place: Path, run: RunCommand) -> CaseResult:
     shutil.rmtree(place)
     return CaseResult(
         fault=case.fault,
-        command=shown(case.arguments),
+        command=" ".join(["velap", *case.arguments]),
         message=message_of(stderr).replace(str(place), "FOLDER"),
         code=code,
         problems=(*judge(code, stderr, case.says), *changes(before, after)))
-
-
-def shown(arguments: Sequence[str]) -> str:
-    """The command as it is typed."""
-    return " ".join(["velap", *arguments])
 
 
 def judge(code: int, stderr: str, says: str) -> list[str]:

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from rich.console import Console
 
-from studies.faults.cases import CASES, DATASET, Answer, CaseResult, RunCommand, check, judge, message_of, shown
+from studies.faults.cases import CASES, DATASET, Answer, CaseResult, RunCommand, check, judge, message_of
 from studies.faults.kills import (
     FILE_LIMIT,
     SMALL,
@@ -114,8 +114,8 @@ def check_disk(case: DiskCase, base: Path, place: Path, run: RunCommand, mount: 
         if case.result and fingerprint(disk) != fingerprint(base / case.result):
             problems.append("with room it ends with other bits")
     shutil.rmtree(place)
-    message = message_of(stderr).replace(str(place), "FOLDER")
-    return CaseResult(fault=case.fault, command=shown(case.arguments), message=message, code=code, problems=tuple(problems))
+    return CaseResult(fault=case.fault, command=" ".join(["velap", *case.arguments]),
+                      message=message_of(stderr).replace(str(place), "FOLDER"), code=code, problems=tuple(problems))
 
 
 def run_alone(arguments: Sequence[str], place: Path, datasets: str = "datasets", limit: int | None = None) -> Answer:

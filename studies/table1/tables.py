@@ -132,7 +132,8 @@ def to_markdown(runs: pd.DataFrame) -> str:
     cells = matrix(runs)
     for task in cells:
         cells[task] += [f"<br>paper {published(str(task), method)}" for method in cells.index]
-    cells.index = pd.Index([f"**{get_method(method).label}**" for method in cells.index], name="method")
+    labels = [get_method(method).label.replace("*", r"\*") for method in cells.index]
+    cells.index = pd.Index([f"**{label}**" for label in labels], name="method")
     return cells.to_markdown()
 
 

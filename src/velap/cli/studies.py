@@ -94,7 +94,7 @@ def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-late
         _study("experts").study_experts(OUT, quick, seed, write, json)
 
 
-def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-widowx", "sawyer-drawing"]],
+def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-widowx"]],
                            arg(help="Number of the paper's figure, or a picture of the documentation.")],
            task: Annotated[Positional[str | None], arg(help="Of figure 3; by default both mazes.")] = None,
            write: Path | None = None, checkpoint: Path | None = None, dataset: str | None = None,
@@ -103,9 +103,8 @@ def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-wid
     """Make a figure of the paper, or draw a picture of the documentation anew.
 
     `3`: the latent space, its values and planned paths. `7` and `8`: success against planning time in SpiralMaze and in
-    ObstacleMaze; interrupt them at any time, the same command goes on from there. `tasks`: test start and goal state of
-    every task, as an agent sees them. `tasks-widowx`: an expert's episode of each task of the WidowX arm. `sawyer-drawing`:
-    our drawing of the Sawyer arm beside Meta-World's geometry.
+    ObstacleMaze; interrupt them at any time, the same command goes on from there. `tasks`: test start and success of every
+    task, as an agent sees them. `tasks-widowx`: an expert's episode of each task of the WidowX arm.
 
     Args:
         write: The PNG; figures of the paper get a PDF beside it. Default: docs/figures/figNUMBER.png or docs/NAME.png (with
@@ -135,10 +134,8 @@ def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-wid
     path = write or Path("docs") / f"{name.replace('-', '_')}.png"
     if name == "tasks":
         _study("gallery").show_tasks(OUT, path)
-    elif name == "tasks-widowx":
-        _study("gallery").show_episodes(OUT, path)
     else:
-        _study("drawing").show_drawing(OUT, path)
+        _study("gallery").show_episodes(OUT, path)
 
 
 def _study(name: str) -> ModuleType:

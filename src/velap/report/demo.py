@@ -15,7 +15,7 @@ from velap.evaluation.rollout import Moment
 from velap.evaluation.summary import Summary, summarise, summary_text
 from velap.methods.tree_agent import TreeAgent
 from velap.models.checkpoint import released_checkpoint
-from velap.report.figures import LatentMap, plan_figure
+from velap.report.figures import LatentMap, Planned, plan_figure, planned
 from velap.report.video import VideoRecorder, latent_map_of, picture
 from velap.search.types import Plan
 
@@ -28,7 +28,7 @@ class FirstPlan:
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
-        self._kept: tuple[NDArray[np.uint8], Plan, int] | None = None
+        self._kept: tuple[Planned, NDArray[np.uint8]] | None = None
 
     def __call__(self, moment: Moment) -> None:
         """Keep the plan once, as soon as it is there."""
@@ -37,15 +37,13 @@ class FirstPlan:
         if wanted and isinstance(agent, TreeAgent) and isinstance(agent.last_plan, Plan):
             rows = np.flatnonzero(agent.last_plan_rows == moment.row)
             if len(rows):
-                self._kept = picture(moment, PICTURE), agent.last_plan, int(rows[0])
+                self._kept = planned(agent.last_plan, int(rows[0])), picture(moment, PICTURE)
 
     def draw(self, latent_map: LatentMap, path: Path) -> bool:
         """Draw it into `path`; False where the episode had no plan."""
         if self._kept is None:
             return False
-        frame, plan, row = self._kept
-        plan_figure(path, frame=frame, plan=plan, row=row, latent_map=latent_map,
-                    title=f"VELAP's first plan of episode {self._seed}")
+        plan_figure(path, *self._kept, latent_map, f"VELAP's first plan of episode {self._seed}")
         return True
 
 

@@ -1,7 +1,6 @@
-"""What pictures of a latent space consist of: states whose positions are known, the 2-D Isomap, the tree of a plan; and the
-picture of one plan.
+"""What pictures consist of: real states, the 2-D Isomap, a plan and its tree, film strips; and the picture of one plan.
 
-P probed states, D latent dimensions, L waypoints, M nodes of a tree, S frame size [px].
+P real states, D latent dimensions, L waypoints, M nodes of a tree, S frame size [px], F frames of a strip.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
 from sklearn.manifold import Isomap
 from sklearn.neighbors import kneighbors_graph
 
@@ -24,36 +24,86 @@ from velap.envs.protocol import Mapped
 from velap.evaluation.rollout import FrameReader
 from velap.models.velap import LatentModel
 from velap.runs import write_atomic
-from velap.search.types import Plan
+from velap.search import types as search
 
 PROBES = 1200
 """States a latent map is made of. ours: about one per hundredth of SpiralMaze's corridor."""
 NEIGHBOURS = 5
 """Fewest neighbours of the Isomap graph. ours; more only where the graph would fall apart: in SpiralMaze, further ones are
 across a wall."""
+COLUMNS = 10
+"""Frames of a strip side by side."""
+MOST_FRAMES = 30
+"""Frames of a strip in all; of longer chains some are left out."""
 SMALLEST_SHOWN = 1e-3
 """Lower end of the logarithmic colours [Q-value]. ours: γ^169."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class LatentMap:
-    """Latents whose robot positions are known: what a latent that a planner dreamt up would look like in the world."""
+class RealStates:
+    """Real states: what they look like, and where they are in the latent space."""
 
+    source: str
+    """Where they come from, in words."""
     latents: NDArray[np.float32]
     """[P, D]."""
+    frames: NDArray[np.uint8]
+    """[P, S, S, 3]; [0, 0, 0, 3] where the latents alone are known."""
+
+    def nearest(self, latents: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Numbers [L] of the states nearest to latents [L, D], and how far they are [L] [latent distance]."""
+        distances = cdist(latents, self.latents)
+        return distances.argmin(1), distances.min(1)
+
+    def spacing(self) -> float:
+        """Mean distance of a state to the nearest other one [latent distance]."""
+        distances = cdist(self.latents, self.latents)
+        np.fill_diagonal(distances, np.inf)
+        return float(distances.min(1).mean())
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatentMap(RealStates):
+    """Real states of one scene whose positions are known."""
+
     positions: NDArray[np.float64]
     """[P, 2] [m]."""
     values: NDArray[np.float32]
     """[P] Q^g [Q-value]."""
     extent: tuple[float, float, float, float]
     """Left, right, bottom, top of the frame [m]."""
-    frames: NDArray[np.uint8]
-    """[P, S, S, 3] what the agent sees there."""
 
-    def locate(self, latents: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Positions [*, 2] of the probed states nearest to latents [*, D] [m]."""
-        squares = (self.latents**2).sum(-1) - 2 * latents @ self.latents.T
-        return self.positions[squares.argmin(-1)]
+    def locate(self, latents: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """Positions [L, 2] of the states nearest to latents [L, D] [m]."""
+        return self.positions[self.nearest(latents)[0]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """One plan, as arrays."""
+
+    latents: NDArray[np.float32]
+    """[M, D] nodes in the order in which they were added, the root first; of a planner without a tree its waypoints."""
+    parents: NDArray[np.int64]
+    """[M] -1 for the root."""
+    path: NDArray[np.int64]
+    """[L] nodes of the chosen path, the root first."""
+
+    @property
+    def waypoints(self) -> NDArray[np.float32]:
+        """[L, D]."""
+        return self.latents[self.path]
+
+
+def planned(plans: search.Path, row: int) -> Planned:
+    """The plan of one row of a batch."""
+    length = int(plans.length[row])
+    if not isinstance(plans, search.Plan):
+        latents, path = plans.waypoints[row, :length].float().cpu().numpy(), np.arange(length)
+        return Planned(latents=latents, parents=path - 1, path=path)
+    size = int(plans.tree.size[row])
+    return Planned(latents=plans.tree.latents[row, :size].float().cpu().numpy(),
+                   parents=plans.tree.parents[row, :size].cpu().numpy(), path=plans.nodes[row, :length].cpu().numpy())
 
 
 def can_probe(env: gym.Env[Any, Any]) -> bool:
@@ -87,12 +137,8 @@ def probe(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, *, fram
     batches = zip(torch.from_numpy(everything).split(256), commands.split(256), strict=True)
     latents = torch.cat([model.encode(batch.to(device), before) for batch, before in batches])
     values = model.value(latents).float().cpu().numpy()
-    return LatentMap(
-        latents=latents.float().cpu().numpy(),
-        positions=np.stack(positions),
-        values=values,
-        extent=world.extent,
-        frames=everything[:, -1])
+    return LatentMap(source="the episode's scene", latents=latents.float().cpu().numpy(), frames=everything[:, -1],
+                     positions=np.stack(positions), values=values, extent=world.extent)
 
 
 def to_pixels(positions: NDArray[np.float64], extent: tuple[float, float, float, float], size: int) -> NDArray[np.float64]:
@@ -102,30 +148,19 @@ def to_pixels(positions: NDArray[np.float64], extent: tuple[float, float, float,
     return np.stack([(x - left) / (right - left) * size, (top - y) / (top - bottom) * size], -1)
 
 
-def plan_figure(path: Path, *, frame: NDArray[np.uint8], plan: Plan, row: int, latent_map: LatentMap, title: str) -> None:
-    """Draw the plan of one row into a PNG.
-
-    Args:
-        path: where to.
-        frame: uint8 [S, S, 3] the state that was planned from.
-        plan: plans of a batch.
-        row: which of them.
-        latent_map: where latents are in the world.
-        title: above the picture.
-    """
-    waypoints = plan.waypoints[row, : plan.length[row]].float().cpu().numpy()
-    size = int(plan.tree.size[row])
-    nodes = plan.tree.latents[row, :size].float().cpu().numpy()
-    parents = plan.tree.parents[row, :size].cpu().numpy()
-    embedded, tree, chosen = embed(latent_map.latents, nodes, waypoints)
+def plan_figure(path: Path, plan: Planned, frame: NDArray[np.uint8], latent_map: LatentMap, title: str) -> None:
+    """Draw a plan over the frame [S, S, 3] that it was made from, in the Isomap, and beside Q^g over positions."""
+    places = latent_map.locate(plan.waypoints)
+    embedded, tree = embed(latent_map.latents, plan.latents)
     colours = value_colours(latent_map.values)
-
     figure = new_figure(15, 5, title)
     in_frame, in_latents, in_world = figure.subplots(1, 3)
-    _draw_frame(in_frame, frame, latent_map, waypoints)
+    in_frame.imshow(frame, extent=latent_map.extent, interpolation="nearest")
+    in_frame.plot(*places.T, "o-", color="tab:orange", markersize=5, linewidth=1.5)
+    in_frame.set(title=f"frame and {len(places) - 1} planned waypoints", xlabel="x [m]", ylabel="y [m]")
     in_latents.scatter(*embedded.T, s=14, **colours)
-    draw_tree(in_latents, tree, parents, label=f"tree, {len(nodes)} nodes")
-    draw_path(in_latents, chosen, label="chosen path", start="now")
+    draw_tree(in_latents, tree, plan.parents, label=f"tree, {len(tree)} nodes")
+    draw_path(in_latents, tree[plan.path], label="chosen path", start="now")
     in_latents.set(title="2-D Isomap of latents", xticks=[], yticks=[])
     in_latents.legend(loc="best", fontsize=8)
     points = in_world.scatter(*latent_map.positions.T, s=14, **colours)
@@ -138,14 +173,16 @@ def plan_figure(path: Path, *, frame: NDArray[np.uint8], plan: Plan, row: int, l
 def embed(latents: NDArray[np.float32], *others: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     """The plane [P, 2] that best keeps the distances of latents [P, D] along their manifold (Isomap), and where in it other
     latents [*, D] lie."""
-    isomap = Isomap(n_neighbors=_enough_neighbours(latents), n_components=2)
-    return [isomap.fit_transform(latents), *(isomap.transform(each) for each in others)]
+    isomap = fit_isomap(latents)
+    return [isomap.embedding_, *(isomap.transform(each) for each in others)]
 
 
-def _enough_neighbours(latents: NDArray[np.float32]) -> int:
-    """The fewest neighbours, `NEIGHBOURS` or more, that keep the graph of latents [P, D] in one piece."""
+def fit_isomap(latents: NDArray[np.float32]) -> Isomap:
+    """The 2-D Isomap of latents [P, D], by the fewest neighbours, `NEIGHBOURS` or more, that keep its graph in one piece."""
     counts = range(min(NEIGHBOURS, len(latents) - 1), len(latents))
-    return next(count for count in counts if connected_components(kneighbors_graph(latents, count), directed=False)[0] == 1)
+    enough = next(count for count in counts
+                  if connected_components(kneighbors_graph(latents, count), directed=False)[0] == 1)
+    return Isomap(n_neighbors=enough, n_components=2).fit(latents)
 
 
 def value_colours(values: NDArray[np.float32]) -> dict[str, Any]:
@@ -167,6 +204,34 @@ def draw_path(axes: Any, path: NDArray[np.floating[Any]], label: str, start: str
     axes.plot(*path[0], "*", color="black", markersize=13, label=start)
 
 
+@dataclass(frozen=True, kw_only=True)
+class FilmStrip:
+    """Frames in a row, each with a caption."""
+
+    title: str
+    frames: NDArray[np.uint8]
+    """[F, H, W, 3]."""
+    captions: tuple[str, ...]
+    """[F]."""
+
+
+def strip_figure(path: Path, strip: FilmStrip) -> None:
+    """Frames in reading order with their captions below."""
+    picked = np.unique(np.linspace(0, len(strip.frames) - 1, min(MOST_FRAMES, len(strip.frames))).astype(int))
+    rows = -(-len(picked) // COLUMNS)
+    columns = min(COLUMNS, max(len(picked), 6))  # a title needs room
+    figure = new_figure(1.5 * columns, 2.05 * rows + 0.5, strip.title)
+    cells = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axes in cells:
+        axes.set_axis_off()
+    for axes, number in zip(cells, picked, strict=False):
+        axes.set_axis_on()
+        axes.imshow(strip.frames[number], interpolation="nearest")
+        axes.set(xticks=[], yticks=[])
+        axes.set_xlabel(strip.captions[number], fontsize=9)
+    save_figure(figure, path)
+
+
 def new_figure(width: float, height: float, title: str) -> Any:
     """An empty figure of that size [inches] that needs no screen."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -184,9 +249,3 @@ def save_figure(figure: Any, path: Path) -> None:
     figure.savefig(content, dpi=110, format=kind, metadata={"CreationDate": None} if kind == "pdf" else None)
     write_atomic(path, content.getvalue())
 
-
-def _draw_frame(axes: Any, frame: NDArray[np.uint8], latent_map: LatentMap, waypoints: NDArray[np.float32]) -> None:
-    """The frame with the waypoints at their positions."""
-    axes.imshow(frame, extent=latent_map.extent, interpolation="nearest")
-    axes.plot(*latent_map.locate(waypoints).T, "o-", color="tab:orange", markersize=5, linewidth=1.5)
-    axes.set(title=f"frame and {len(waypoints) - 1} planned waypoints", xlabel="x [m]", ylabel="y [m]")

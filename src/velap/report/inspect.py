@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from velap.config.training import DYNAMICS_HORIZON
 from velap.data.card import dataset_card, draw_frames, episode_returns
@@ -19,7 +19,7 @@ from velap.data.images import IMAGE_SIZE, Fit
 from velap.data.loading import load_store
 from velap.data.survey import FEWEST_STILL, JUMP, NEIGHBOURS, SAME_SCENE, Actions, Coverage, Scenes, Survey, survey
 from velap.errors import DatasetError
-from velap.report.figures import new_figure, save_figure
+from velap.report.figures import FilmStrip, new_figure, save_figure, strip_figure
 from velap.runs import write_atomic
 
 PAGE, FIGURES = "inspection.md", "inspection.json"
@@ -47,7 +47,7 @@ SHOWN = 24
 """Backgrounds and lonely frames in pictures at most."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Problem:
     """Something that will not work, or not well."""
 
@@ -63,7 +63,7 @@ class Problem:
         """What an error says, which is written as `got; expected. do`."""
         got, _, rest = str(error).partition("; expected ")
         expected, _, advice = rest.partition(". ")
-        return cls(name=name, got=got, expected=expected, do=advice, stops=True)
+        return cls(name, got, expected, advice, stops=True)
 
     def __str__(self) -> str:
         return f"{'STOPS' if self.stops else 'warns'}  {self.name}: {self.got}; expected {self.expected}. {self.do}"
@@ -111,142 +111,121 @@ def find_problems(store: FrameStore, found: Survey) -> list[Problem]:
     return sorted(problems, key=lambda problem: not problem.stops)
 
 
-def _length_problems(store: FrameStore) -> list[Problem]:
+def _length_problems(store: FrameStore) -> Iterator[Problem]:
     short = int((store.episode_length < DYNAMICS_HORIZON).sum())
     if short == store.n_episodes:
-        return [Problem(
-            name="short-episodes", stops=True, got=f"the longest episode has {store.episode_length.max()} transitions",
-            expected=f"one of {DYNAMICS_HORIZON} or more", do="Record longer episodes, or join consecutive ones.")]
-    problems = []
+        yield Problem("short-episodes", stops=True,
+                      got=f"the longest episode has {store.episode_length.max()} transitions",
+                      expected=f"one of {DYNAMICS_HORIZON} or more", do="Record longer episodes, or join consecutive ones.")
+        return
     if short > MOST * store.n_episodes:
-        problems.append(Problem(
-            name="short-episodes",
-            got=f"{short} of {store.n_episodes} episodes have fewer than {DYNAMICS_HORIZON} transitions",
-            expected="most to be longer",
-            do="Record longer episodes. Look whether they end too early: a flag at the wrong step cuts them."))
+        yield Problem("short-episodes",
+                      got=f"{short} of {store.n_episodes} episodes have fewer than {DYNAMICS_HORIZON} transitions",
+                      expected="most to be longer",
+                      do="Record longer episodes. Check whether a flag at the wrong step cuts them.")
     if store.n_transitions < FEW_TRANSITIONS:
-        problems.append(Problem(
-            name="few-transitions", got=f"{store.n_transitions:,} transitions",
-            expected=f"{FEW_TRANSITIONS:,} or more; the paper's tasks have 20,000 to 150,000",
-            do="Record more; play without any aim helps too."))
-    return problems
+        yield Problem("few-transitions", got=f"{store.n_transitions:,} transitions",
+                      expected=f"{FEW_TRANSITIONS:,} or more; the paper's tasks have 20,000 to 150,000",
+                      do="Record more; play without any aim helps too.")
 
 
-def _success_problems(store: FrameStore, coverage: Coverage | None) -> list[Problem]:
+def _success_problems(store: FrameStore, coverage: Coverage | None) -> Iterator[Problem]:
     won = episode_returns(store) > 0
-    successes, problems = int(won.sum()), []
+    successes = int(won.sum())
     if successes == 0:
-        return []  # the reader says so
+        return  # the reader says so
     if successes < FEW_SUCCESSES:
-        problems.append(Problem(
-            name="few-successes", got=f"{successes} successful episodes", expected=f"{FEW_SUCCESSES} or more",
-            do="Record some more from anywhere near the goal, or look whether the rule of success misses some (`velap "
-               "label` shows the last frames)."))
+        yield Problem("few-successes", got=f"{successes} successful episodes", expected=f"{FEW_SUCCESSES} or more",
+                      do="Record more from anywhere near the goal, or check whether the rule of success misses some "
+                         "(`velap label` shows the last frames).")
     at_once = int((store.episode_length[won] == 1).sum())
     if at_once > MOST * successes:
-        problems.append(Problem(
-            name="success-at-once", got=f"{at_once} of {successes} successful episodes succeed at their first step",
-            expected="successes that take some steps",
-            do="Look at the rule of success: it may hold at the start already. Name another with --success."))
-    return problems if coverage is None else [*problems, *_goal_problems(coverage)]
+        yield Problem("success-at-once", got=f"{at_once} of {successes} successful episodes succeed at their first step",
+                      expected="successes that take some steps",
+                      do="Check the rule of success: it may hold at the start already. Name another with --success.")
+    if coverage is not None:
+        yield from _goal_problems(coverage)
 
 
-def _goal_problems(coverage: Coverage) -> list[Problem]:
+def _goal_problems(coverage: Coverage) -> Iterator[Problem]:
     """What the frames of success look like, and whether they can be reached."""
-    problems = []
     if coverage.jumps > MOST:
-        problems.append(Problem(
-            name="success-frame-jumps",
-            got=f"in {coverage.jumps:.0%} of the successful episodes the last step changes the frame by more than "
-                f"{JUMP:.0%} of all steps do",
-            expected="the frame that shows the success",
-            do="Look at the red frames of frames.png: recorders that reset by themselves store the next episode's first "
-               "frame there. Store the final observation instead."))
+        yield Problem("success-frame-jumps",
+                      got=f"in {coverage.jumps:.0%} of the successful episodes the last step changes the frame by more than "
+                          f"{JUMP:.0%} of all steps do",
+                      expected="the frame that shows the success",
+                      do="Look at the red frames of frames.png: some recorders store the next episode's first frame there. "
+                         "Store the final observation instead.")
     elif coverage.start_like > MOST and not coverage.start_like_others > coverage.start_like / 2:
-        problems.append(Problem(
-            name="success-looks-like-start",
-            got=f"{coverage.start_like:.0%} of the frames of success look like the first frame of an episode",
-            expected="success to be visible in the frame",
-            do="Look at the red frames of frames.png. Turn the camera so that it sees what success changes, or name another "
-               "rule with --success."))
+        yield Problem("success-looks-like-start",
+                      got=f"{coverage.start_like:.0%} of the frames of success look like the first frame of an episode",
+                      expected="success to be visible in the frame",
+                      do="Look at the red frames of frames.png. Turn the camera so that it sees what success changes, or "
+                         "name another rule with --success.")
     if coverage.in_reach < OUT_OF_REACH:
-        problems.append(Problem(
-            name="success-out-of-reach",
-            got=f"{coverage.in_reach:.0%} of the episodes without success start where recorded frames lead on to a success",
-            expected=f"{OUT_OF_REACH:.0%} or more",
-            do="Record episodes that lead from where the others are to where the successful ones begin, in the same scene "
-               "and from the same camera."))
-    return problems
+        yield Problem("success-out-of-reach",
+                      got=f"{coverage.in_reach:.0%} of the episodes without success start where recorded frames lead on to "
+                          "a success",
+                      expected=f"{OUT_OF_REACH:.0%} or more",
+                      do="Record episodes that lead from where the others are to where the successful ones begin, in the "
+                         "same scene and from the same camera.")
 
 
-def _frame_problems(found: Survey) -> list[Problem]:
+def _frame_problems(found: Survey) -> Iterator[Problem]:
     equal = f"{found.frozen_frames:.0%} of the frames equal the one before"
     if found.coverage is None or found.frozen_frames > 0.99:
-        return [Problem(
-            name="constant-frames", got=equal, expected="frames that show what the actions do",
-            do="Look whether the recorder stores the newest picture, and whether it is the right camera (--image-key).")]
-    problems = []
+        yield Problem("constant-frames", got=equal, expected="frames that show what the actions do",
+                      do="Check that the recorder stores the newest picture, and of the right camera (--image-key).")
+        return
     if found.frozen_frames > MANY_EQUAL:
-        problems.append(Problem(
-            name="repeated-frames", got=equal, expected=f"at most {MANY_EQUAL:.0%}",
-            do="Record actions at the rate of the camera, or leave out steps in which nothing happens."))
+        yield Problem("repeated-frames", got=equal, expected=f"at most {MANY_EQUAL:.0%}",
+                      do="Record actions at the rate of the camera, or leave out steps in which nothing happens.")
     if found.contrast < LITTLE_CONTRAST:
-        problems.append(Problem(
-            name="blank-frames", got=f"pixels deviate by {found.contrast:.1f} grey levels within a frame",
-            expected=f"{LITTLE_CONTRAST:g} or more",
-            do="Look at frames.png: the lens may be covered, or float images may have been stored in a wrong range."))
-    return problems
+        yield Problem("blank-frames", got=f"pixels deviate by {found.contrast:.1f} grey levels within a frame",
+                      expected=f"{LITTLE_CONTRAST:g} or more",
+                      do="Look at frames.png: the lens may be covered, or float images may be stored in a wrong range.")
 
 
-def _action_problems(store: FrameStore, actions: Actions) -> list[Problem]:
-    problems, varying = [], ~actions.constant
+def _action_problems(store: FrameStore, actions: Actions) -> Iterator[Problem]:
+    varying = ~actions.constant
     if actions.constant.any():
         which = ", ".join(str(entry) for entry in np.flatnonzero(actions.constant))
-        problems.append(Problem(
-            name="constant-actions", got=f"entries {which} of the actions never vary", expected="every entry to vary",
-            do="Leave them out of the action: policies could put anything there, and no data tell the effect."))
+        yield Problem("constant-actions", got=f"entries {which} of the actions never vary", expected="every entry to vary",
+                      do="Leave them out of the action: policies could put anything there, and no data tell the effect.")
     clipped = varying & (actions.at_bound > MUCH_AT_BOUND)
     if clipped.any():
         which = ", ".join(f"{entry} ({actions.at_bound[entry]:.0%})" for entry in np.flatnonzero(clipped))
-        problems.append(Problem(
-            name="clipped-actions", got=f"entries {which} of the actions lie at a bound",
-            expected=f"at most {MUCH_AT_BOUND:.0%} of them",
-            do="Look whether the recorded commands are scaled as the action space says. A gripper that only opens and "
-               "closes is fine."))
+        yield Problem("clipped-actions", got=f"entries {which} of the actions lie at a bound",
+                      expected=f"at most {MUCH_AT_BOUND:.0%} of them",
+                      do="Check whether the recorded commands are scaled as the action space says. A gripper that only "
+                         "opens and closes is fine.")
     used = (actions.highest - actions.lowest) / (store.action_high - store.action_low)
     small = varying & (used < SMALL_RANGE)
     if small.any():
         which = ", ".join(f"{entry} ({used[entry]:.1%})" for entry in np.flatnonzero(small))
-        problems.append(Problem(
-            name="small-actions", got=f"entries {which} of the actions use little of the stated range",
-            expected=f"{SMALL_RANGE:.0%} or more",
-            do="State the range that is used as the bounds of the action space: actions are scaled by it, and these hardly "
-               "differ from 0."))
+        yield Problem("small-actions", got=f"entries {which} of the actions use little of the stated range",
+                      expected=f"{SMALL_RANGE:.0%} or more",
+                      do="State the range that is used as the bounds of the action space: actions are scaled by it, and "
+                         "these hardly differ from 0.")
     if actions.autocorrelation[1] < JITTER:
-        problems.append(Problem(
-            name="jittery-actions", got=f"subsequent actions correlate by {actions.autocorrelation[1]:.2f}",
-            expected=f"{JITTER:g} or more",
-            do="Noise that changes every step leads nowhere: hold actions for some steps. Look too whether actions and "
-               "frames belong to the same steps."))
-    return problems
+        yield Problem("jittery-actions", got=f"subsequent actions correlate by {actions.autocorrelation[1]:.2f}",
+                      expected=f"{JITTER:g} or more",
+                      do="Noise that changes every step leads nowhere: hold actions for some steps. Check too whether "
+                         "actions and frames belong to the same steps.")
 
 
-def _coverage_problems(scenes: Scenes, coverage: Coverage | None) -> list[Problem]:
-    problems = []
+def _coverage_problems(scenes: Scenes, coverage: Coverage | None) -> Iterator[Problem]:
     if scenes.together < 0.1 and scenes.count > 0.5 * len(scenes.episodes) > 2:
-        problems.append(Problem(
-            name="one-episode-a-scene",
-            got=f"{scenes.count} scenes among {len(scenes.episodes)} episodes, and {scenes.together:.0%} of subsequent "
-                "episodes share one",
-            expected="several episodes in each scene",
-            do="Record ten or more episodes before anything that they do not move themselves is moved: ways are stitched "
-               "within a scene."))
+        yield Problem("one-episode-a-scene",
+                      got=f"{scenes.count} scenes among {len(scenes.episodes)} episodes, and {scenes.together:.0%} of "
+                          "subsequent episodes share one",
+                      expected="several episodes in each scene",
+                      do="Record ten or more episodes before you move anything that they do not move themselves: ways are "
+                         "stitched within a scene.")
     if coverage is not None and coverage.lonely > LONELY:
-        problems.append(Problem(
-            name="thin-coverage", got=f"no other episode comes near {coverage.lonely:.0%} of the frames",
-            expected=f"at most {LONELY:.0%}",
-            do="Record more episodes in the same scenes, above all where coverage.png shows lonely frames."))
-    return problems
+        yield Problem("thin-coverage", got=f"no other episode comes near {coverage.lonely:.0%} of the frames",
+                      expected=f"at most {LONELY:.0%}",
+                      do="Record more episodes in the same scenes, above all where coverage.png shows lonely frames.")
 
 
 def inspection_text(inspection: Inspection) -> str:
@@ -350,19 +329,15 @@ def save_inspection(inspection: Inspection, out: Path) -> list[Path]:
     return paths
 
 
-def draw_scenes(found: Survey, path: Path, columns: int = 8, side: int = 128, gap: int = 4) -> None:
+def draw_scenes(found: Survey, path: Path) -> None:
     """The background of one episode of each scene, those with most episodes first."""
     scenes = found.scenes
     labels = scenes.labels if scenes.count else np.arange(len(scenes.episodes))
     _, firsts, counts = np.unique(labels, return_index=True, return_counts=True)
-    order = firsts[np.argsort(-counts, kind="stable")][:SHOWN]
-    columns = min(columns, len(order))
-    rows = -(-len(order) // columns)
-    sheet = Image.new("RGB", (columns * (side + gap) + gap, rows * (side + gap) + gap), "white")
-    for number, episode in enumerate(order):
-        tile = Image.fromarray(scenes.backgrounds[episode]).resize((side, side), Image.Resampling.NEAREST)
-        sheet.paste(tile, (gap + number % columns * (side + gap), gap + number // columns * (side + gap)))
-    sheet.save(path)
+    order = np.argsort(-counts, kind="stable")[:SHOWN]
+    strip_figure(path, FilmStrip(title="Scenes: what stands still in an episode of each",
+                                 frames=scenes.backgrounds[firsts[order]],
+                                 captions=tuple(f"{count} episodes" for count in counts[order])))
 
 
 def draw_coverage(store: FrameStore, coverage: Coverage, path: Path) -> None:

@@ -26,7 +26,17 @@ from velap.evaluation.evaluate import Evaluation, load_player, make_env
 from velap.methods.provenance import search_of
 from velap.methods.states import StateEncoder
 from velap.models.checkpoint import load_checkpoint, released_checkpoint
-from velap.report.figures import PROBES, draw_path, draw_tree, embed, new_figure, probe, save_figure, value_colours
+from velap.report.figures import (
+    PROBES,
+    draw_path,
+    draw_tree,
+    embed,
+    new_figure,
+    planned,
+    probe,
+    save_figure,
+    value_colours,
+)
 from velap.runs import write_atomic
 from velap.tasks import TASKS
 from velap.training.encoding import encode_rows
@@ -133,17 +143,16 @@ def _space(model: LatentModel, config: Config, title: str, latents: NDArray[np.f
     generators = [torch.Generator().manual_seed(FIRST_SEED + row) for row in range(len(roots))]
     with torch.inference_mode():
         found = search_of(model, config)(roots, generators)
-    size, lengths = int(found.tree.size[0]), found.length.tolist()
-    waypoints = [found.waypoints[row, :length].float().cpu().numpy() for row, length in enumerate(lengths)]
-    plane, tree, *paths = embed(latents, found.tree.latents[0, :size].float().cpu().numpy(), *waypoints)
-    padded = np.full((len(paths), max(lengths), 2), np.nan, np.float32)
+    plans = [planned(found, row) for row in range(len(roots))]
+    plane, tree, *paths = embed(latents, plans[0].latents, *(each.waypoints for each in plans))
+    padded = np.full((len(paths), max(map(len, paths)), 2), np.nan, np.float32)
     for row, path in enumerate(paths):
         padded[row, : len(path)] = path
     chosen = spread(world["positions"] if len(world["positions"]) else plane, LANDMARKS)
     landmarks = chosen[np.argsort(values[chosen], kind="stable")]
     return LatentSpace(title=title, plane=plane.astype(np.float32), values=values, landmarks=landmarks,
                        frames=frames[landmarks], paths=padded, tree=tree.astype(np.float32),
-                       parents=found.tree.parents[0, :size].cpu().numpy(), **world)
+                       parents=plans[0].parents, **world)
 
 
 def spread(places: NDArray[np.floating[Any]], count: int) -> NDArray[np.int64]:

@@ -1,6 +1,6 @@
 """`velap view`: what an agent did in an episode, step by step, and real states to compare its latents with.
 
-T steps of an episode, D latent dimensions, M nodes of a tree, L waypoints, P states of a backdrop, H x W pixels.
+T steps of an episode, D latent dimensions.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from velap.evaluation.evaluate import Evaluation, Player, load_player
 from velap.evaluation.records import Record, read_records
 from velap.evaluation.rollout import Episode, Moment
 from velap.methods.tree_agent import FOLLOWING, Actor, TreeAgent
-from velap.report.demo import released_checkpoint
+from velap.models.checkpoint import load_checkpoint, released_checkpoint
 from velap.report.diagnose.model import open_recorded, real_states_of
-from velap.report.figures import can_probe, probe
+from velap.report.figures import Planned, RealStates, can_probe, planned, probe
 from velap.report.video import picture
 from velap.search.types import Plan
 from velap.tasks import TASKS
@@ -31,31 +31,20 @@ FIRST_SEED = 1000
 SIDE = 256
 """Side of the pictures of the world [px]."""
 STATES = 1200
-"""P at most. ours: enough to see a maze's corridors, and some seconds of Isomap."""
+"""Real states in the map at most. ours: enough to see a maze's corridors, and some seconds of Isomap."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planned:
-    """One plan of the episode."""
+class MadePlan(Planned):
+    """A plan, and when it was made."""
 
     step: int
     """Step that it was made at."""
-    latents: NDArray[np.float32]
-    """[M, D] nodes in the order in which they were added, the root first; of a planner without a tree its waypoints."""
-    parents: NDArray[np.int64]
-    """[M] -1 for the root."""
-    path: NDArray[np.int64]
-    """[L] nodes of the chosen path, root first."""
     reached_goal: bool | None
     """Some node has Q^g > τ_goal; None where the planner does not tell."""
     cost: float | None
     """c(g*) [steps]."""
     milliseconds: float
-
-    @property
-    def waypoints(self) -> NDArray[np.float32]:
-        """[L, D]."""
-        return self.latents[self.path]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +73,7 @@ class Trace:
     steps: tuple[Step, ...]
     last_picture: NDArray[np.uint8]
     """[SIDE, SIDE, 3] after the last action."""
-    plans: tuple[Planned, ...]
+    plans: tuple[MadePlan, ...]
 
 
 class Tracer:
@@ -92,13 +81,13 @@ class Tracer:
 
     def __init__(self) -> None:
         self._steps: list[Step] = []
-        self._plans: list[Planned] = []
+        self._plans: list[MadePlan] = []
         self.traces: list[Trace] = []
         """Finished episodes."""
 
     def __call__(self, moment: Moment) -> None:
         """Keep a step, or close the episode."""
-        seen = picture(moment.env, SIDE)
+        seen = picture(moment, SIDE)
         if moment.outcome is not None:
             self.traces.append(Trace(outcome=moment.outcome, steps=tuple(self._steps), last_picture=seen,
                                      plans=tuple(self._plans)))
@@ -110,26 +99,21 @@ class Tracer:
 
     def _step_of(self, agent: TreeAgent, row: int, seen: NDArray[np.uint8]) -> Step:
         if row in agent.planned_rows:
-            self._plans.append(_planned(agent, row, len(self._steps)))
+            self._plans.append(_made(agent, row, len(self._steps)))
         actor = agent.last_actors[row]
         return Step(picture=seen, latent=agent.last_latents[row], value=float(agent.last_values[row]), actor=actor,
                     waypoint=int(agent.plans.current[row]) if actor in FOLLOWING else None,
                     plan=len(self._plans) - 1 if self._plans else None)
 
 
-def _planned(agent: TreeAgent, row: int, step: int) -> Planned:
+def _made(agent: TreeAgent, row: int, step: int) -> MadePlan:
     """The plan that the agent has just made for `row`."""
-    plan, place = agent.last_plan, int(np.flatnonzero(agent.last_plan_rows == row)[0])
-    assert plan is not None
-    length, milliseconds = int(plan.length[place]), float(agent.last_plan_ms[row])
-    if not isinstance(plan, Plan):
-        return Planned(step=step, latents=plan.waypoints[place, :length].float().cpu().numpy(),
-                       parents=np.arange(length) - 1, path=np.arange(length), reached_goal=None, cost=None,
-                       milliseconds=milliseconds)
-    size = int(plan.tree.size[place])
-    return Planned(step=step, latents=plan.tree.latents[place, :size].float().cpu().numpy(),
-                   parents=plan.tree.parents[place, :size].cpu().numpy(), path=plan.nodes[place, :length].cpu().numpy(),
-                   reached_goal=bool(plan.reached_goal[place]), cost=float(plan.cost[place]), milliseconds=milliseconds)
+    plans, place = agent.last_plan, int(np.flatnonzero(agent.last_plan_rows == row)[0])
+    assert plans is not None
+    tree = plans if isinstance(plans, Plan) else None
+    return MadePlan(**vars(planned(plans, place)), step=step, milliseconds=float(agent.last_plan_ms[row]),
+                    reached_goal=None if tree is None else bool(tree.reached_goal[place]),
+                    cost=None if tree is None else float(tree.cost[place]))
 
 
 def trace(player: Player, seed: int) -> Trace:
@@ -140,25 +124,7 @@ def trace(player: Player, seed: int) -> Trace:
     return tracer.traces[0]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Backdrop:
-    """Real states that the latents of an episode are shown among."""
-
-    source: str
-    """Where they come from, in words."""
-    latents: NDArray[np.float32]
-    """[P, D]."""
-    frames: NDArray[np.uint8] | None
-    """[P, H, W, 3]; None where the latents alone are known."""
-
-    def nearest(self, latents: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Numbers [L] of the states nearest to latents [L, D], and how far they are [L] [latent distance]."""
-        away = np.linalg.norm(latents[:, None].astype(np.float64) - self.latents, axis=-1)
-        found = away.argmin(1)
-        return found, away[np.arange(len(found)), found]
-
-
-def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: int = STATES) -> Backdrop | None:
+def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: int = STATES) -> RealStates | None:
     """Real states: of the dataset where one is named; else of the episode's own scene, where the environment can be put
     anywhere; else of the task's dataset, where it is here; else the bank of latents in the checkpoint, without frames."""
     if player.model is None:
@@ -168,9 +134,8 @@ def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: in
         env = player.make_env()
         try:
             if can_probe(env):
-                found = probe(player.model, env, player.frames_of(env), frame_stack=player.config.model.frame_stack, rng=rng,
-                              count=count, seed=seed)
-                return Backdrop(source="the episode's scene", latents=found.latents, frames=found.frames)
+                return probe(player.model, env, player.frames_of(env), frame_stack=player.config.model.frame_stack, rng=rng,
+                             count=count, seed=seed)
         finally:
             env.close()
         own = TASKS[player.key.task].dataset_id if player.key.task in TASKS else None
@@ -178,12 +143,12 @@ def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: in
     if dataset is not None:
         metadata = {"seed": str(player.key.train_seed), "reading": player.reading.to_json()}
         recorded = open_recorded(dataset, player.key.image_key, player.model, player.config, metadata)
-        states = real_states_of(player.model, recorded, rng, count)
-        return Backdrop(source=f"the dataset {dataset}", latents=states.latents.cpu().numpy(), frames=states.frames)
+        return real_states_of(player.model, recorded, rng, count)
     bank = getattr(player.model, "bank_latents", torch.empty(0))
     if len(bank) == 0:
         return None
-    return Backdrop(source="the checkpoint's bank", latents=bank.float().cpu().numpy()[:count], frames=None)
+    return RealStates(source="the checkpoint's bank", latents=bank[:count].float().cpu().numpy(),
+                      frames=np.empty((0, 0, 0, 3), np.uint8))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,8 +170,6 @@ def subject_of(source: Path, *, episode_seed: int | None = None, checkpoint: Pat
     unless one is named.
     """
     if source.suffix != ".jsonl":
-        from velap.models.checkpoint import load_checkpoint
-
         task = load_checkpoint(source)[1].task
         what = Evaluation(task, method=method, checkpoint=source, env=env, env_kwargs=env_kwargs or {}, max_steps=max_steps,
                           device=device)

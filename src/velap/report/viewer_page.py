@@ -17,14 +17,12 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 from sklearn.decomposition import PCA
-from sklearn.manifold import Isomap
 
 from velap.errors import ConfigError
-from velap.evaluation.records import Record
 from velap.methods.tree_agent import IN_WORDS
 from velap.models.horizon import q_from_steps
-from velap.report.figures import NEIGHBOURS
-from velap.report.viewer import SIDE, Backdrop, Planned, Subject, Trace
+from velap.report.figures import NEIGHBOURS, RealStates, fit_isomap
+from velap.report.viewer import SIDE, MadePlan, Subject, Trace
 from velap.search.types import SearchFns
 
 Projection = Literal["isomap", "pca"]
@@ -41,7 +39,7 @@ DIGITS = 4
 """Of values [Q-value]."""
 
 
-def page(subject: Subject, trace: Trace, backdrop: Backdrop | None, projection: Projection = "isomap") -> str:
+def page(subject: Subject, trace: Trace, backdrop: RealStates | None, projection: Projection = "isomap") -> str:
     """The HTML text; raises ConfigError where the episode is too long for a page of LARGEST bytes."""
     template = files("velap.report").joinpath(TEMPLATE).read_text(encoding="utf-8")
     data = episode_data(subject, trace, backdrop, projection)
@@ -54,11 +52,14 @@ def page(subject: Subject, trace: Trace, backdrop: Backdrop | None, projection: 
                       f"bytes; expected at most {LARGEST:,}. View a shorter episode, with --max-steps.")
 
 
-def episode_data(subject: Subject, trace: Trace, backdrop: Backdrop | None, projection: Projection) -> dict[str, Any]:
+def episode_data(subject: Subject, trace: Trace, backdrop: RealStates | None, projection: Projection) -> dict[str, Any]:
     """What the page shows, but the pictures of the world."""
     player, outcome = subject.player, trace.outcome
     config, key = player.config, player.key
-    flat = _Plane(trace, backdrop, projection)
+    trail = [step.latent for step in trace.steps if step.latent is not None]
+    around = np.empty(0, np.float32) if backdrop is None else backdrop.latents
+    groups = [np.array(trail), around, *(plan.latents for plan in trace.plans)]
+    plane, (trail_points, around_points, *plan_points) = _in_one_plane(groups, backdrop, projection)
     ended = "solved" if outcome.success else "not solved"
     discount = None if player.model is None else _functions(subject).discount
     return {
@@ -73,21 +74,22 @@ def episode_data(subject: Subject, trace: Trace, backdrop: Backdrop | None, proj
         "in_words": IN_WORDS,
         "stop_value": None if discount is None else q_from_steps(config.controller.stop_exponent, discount),
         "discount": discount,
-        "trail": flat.trail,
-        "backdrop": None if backdrop is None else {"source": backdrop.source, "points": flat.backdrop,
+        "trail": trail_points,
+        "backdrop": None if backdrop is None else {"source": backdrop.source, "points": around_points,
                                                    "values": _values(subject, backdrop.latents)},
-        "projection": flat.name,
-        "plans": [_plan_data(subject, plan, points, backdrop) for plan, points in zip(trace.plans, flat.plans, strict=True)],
+        "projection": plane,
+        "plans": [_plan_data(subject, *each, backdrop) for each in zip(trace.plans, plan_points, strict=True)],
         "tiles": _tiles(trace.plans, backdrop),
-        "records": [_record_data(record) for record in subject.records],
+        "records": [{"seed": record.episode_seed, "success": record.success, "steps": record.steps}
+                    for record in subject.records],
         "seed": outcome.seed,
     }
 
 
-def _plan_data(subject: Subject, plan: Planned, points: list[list[int]], backdrop: Backdrop | None) -> dict[str, Any]:
+def _plan_data(subject: Subject, plan: MadePlan, points: list[list[int]], backdrop: RealStates | None) -> dict[str, Any]:
     values = _values(subject, plan.latents)
     strip: list[dict[str, Any]] = []
-    if backdrop is not None and backdrop.frames is not None:
+    if backdrop is not None and len(backdrop.frames):
         found, away = backdrop.nearest(plan.waypoints)
         unit = _functions(subject).step_distance or 1.0
         # one-step distances are the planner's: the upper 5-percentile in the data
@@ -113,13 +115,9 @@ def _values(subject: Subject, latents: NDArray[np.float32]) -> list[float]:
     return [round(float(value), DIGITS) for value in values.double().cpu().numpy()]
 
 
-def _record_data(record: Record) -> dict[str, Any]:
-    return {"seed": record.episode_seed, "success": record.success, "steps": record.steps}
-
-
-def _tiles(plans: Sequence[Planned], backdrop: Backdrop | None) -> dict[int, str]:
+def _tiles(plans: Sequence[MadePlan], backdrop: RealStates | None) -> dict[int, str]:
     """Frames of the backdrop that some film strip shows, as data URIs by number."""
-    if backdrop is None or backdrop.frames is None:
+    if backdrop is None or not len(backdrop.frames):
         return {}
     shown = {int(number) for plan in plans for number in backdrop.nearest(plan.waypoints)[0]}
     return {number: _webp(backdrop.frames[number], backdrop.frames.shape[1], lossless=True) for number in sorted(shown)}
@@ -134,42 +132,21 @@ def _webp(image: NDArray[np.uint8], side: int, lossless: bool = False) -> str:
     return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()
 
 
-class _Plane:
-    """All latents of the page in one plane, as whole coordinates from 0 to GRID."""
+def _in_one_plane(groups: Sequence[NDArray[np.float32]], backdrop: RealStates | None,
+                  projection: Projection) -> tuple[str, list[list[list[int]]]]:
+    """Groups of latents [*, D] as whole coordinates from 0 to GRID of one plane, and its name. The plane fits the backdrop,
+    or without one all latents.
 
-    def __init__(self, trace: Trace, backdrop: Backdrop | None, projection: Projection) -> None:
-        latents = [step.latent for step in trace.steps if step.latent is not None]
-        trail = np.stack(latents) if latents else np.zeros((0, 2), np.float32)
-        nodes = [plan.latents for plan in trace.plans]
-        everything = np.concatenate([trail, *nodes])
-        fitted = everything if backdrop is None else backdrop.latents
-        if projection == "isomap" and backdrop is not None and len(fitted) > 10 * NEIGHBOURS:
-            self.name, transform = "Isomap", _isomap(fitted)
-        else:
-            self.name, transform = "principal components", _pca(fitted)
-        groups = [trail, np.zeros((0, trail.shape[1]), np.float32) if backdrop is None else backdrop.latents, *nodes]
-        placed = [transform(group) for group in groups]
-        whole = _whole(np.concatenate(placed))
-        split = np.split(whole, np.cumsum([len(group) for group in placed])[:-1])
-        self.trail, self.backdrop, *self.plans = (part.tolist() for part in split)
-
-
-def _isomap(fitted: NDArray[np.float32]) -> Any:
-    isomap = Isomap(n_neighbors=NEIGHBOURS, n_components=2).fit(fitted.astype(np.float64))
-    return lambda latents: isomap.transform(latents.astype(np.float64)) if len(latents) else np.zeros((0, 2))
-
-
-def _pca(fitted: NDArray[np.float32]) -> Any:
-    if len(fitted) < 2:
-        return lambda latents: np.zeros((len(latents), 2))
-    pca = PCA(2).fit(fitted.astype(np.float64))
-    return lambda latents: pca.transform(latents.astype(np.float64)) if len(latents) else np.zeros((0, 2))
-
-
-def _whole(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Both axes by one scale, so that distances keep their proportions."""
-    if len(points) == 0:
-        return np.zeros((0, 2), np.int64)
-    low, span = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-9)
-    shift = (GRID - np.ptp(points, axis=0) / span * GRID) / 2
-    return ((points - low) / span * GRID + shift).round().astype(np.int64)
+    Both axes have one scale, so that distances keep their proportions.
+    """
+    isomap = projection == "isomap" and backdrop is not None and len(backdrop.latents) > 10 * NEIGHBOURS
+    everything = np.concatenate([group for group in groups if len(group)] or [np.zeros((1, 2), np.float32)])
+    fitted, points = everything if backdrop is None else backdrop.latents, np.zeros((len(everything), 2))
+    if len(fitted) > 1:
+        plane = fit_isomap(fitted) if isomap else PCA(2).fit(fitted)
+        points = plane.transform(everything)
+    size = np.ptp(points, axis=0)
+    scale = GRID / max(float(size.max()), 1e-9)
+    whole = ((points - points.min(axis=0)) * scale + (GRID - size * scale) / 2).round().astype(np.int64)
+    split = np.split(whole, np.cumsum([len(group) for group in groups])[:-1])
+    return "Isomap" if isomap else "principal components", [part.tolist() for part in split]

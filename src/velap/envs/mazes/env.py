@@ -151,9 +151,9 @@ class BlockMaze(PixelTask):
         self.data.qpos[:] = position
         mujoco.mj_forward(self.model, self.data)
 
-    def in_test_region(self, position: NDArray[np.float64] | None = None) -> bool:
-        """Could a test episode start at block centre position[2] [m] (by default the present one)?"""
-        return bool(self.layout.test_starts.contains(self.data.qpos if position is None else position))
+    def in_test_region(self) -> bool:
+        """Could a test episode start at the block's place?"""
+        return bool(self.layout.test_starts.contains(self.data.qpos))
 
     def free_positions(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Block centres [count, 2] [m], uniform over the free space outside the goal."""

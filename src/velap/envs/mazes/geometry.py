@@ -8,7 +8,6 @@ Letters: P points, N nodes (corners), W walls.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 TOUCH = 1e-9
 """Slack of a contact [m]: a path may slide along a wall."""
@@ -140,25 +140,15 @@ class Layout:
 
     @cached_property
     def _corner_distance(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Dijkstra outwards from the goal: distance [N] [m] (inf if cut off), next corner [N] (-1: straight to the goal)."""
+        """Outwards from the goal: distance [N] [m] (inf if cut off), next corner [N] (-1: straight to the goal)."""
         nodes = self.corners
-        target = self.reachable_goal.nearest(nodes)
-        straight = np.linalg.norm(nodes - target, axis=-1)
-        distance = np.where(self.sees(nodes, target), straight, np.inf)
-        following = np.full(len(nodes), -1)
-        visible = self.sees(nodes[:, None], nodes[None])
-        queue = [(d, i) for i, d in enumerate(distance) if np.isfinite(d)]
-        heapq.heapify(queue)
-        while queue:
-            d, i = heapq.heappop(queue)
-            if d > distance[i]:
-                continue
-            for j in np.flatnonzero(visible[i]):
-                longer = d + float(np.linalg.norm(nodes[i] - nodes[j]))
-                if longer < distance[j] - 1e-15:
-                    distance[j], following[j] = longer, i
-                    heapq.heappush(queue, (longer, int(j)))
-        return distance, following
+        goal, target = len(nodes), self.reachable_goal.nearest(nodes)
+        ways = np.full((goal + 1, goal + 1), np.inf)
+        apart = np.linalg.norm(nodes[:, None] - nodes, axis=-1)
+        ways[:goal, :goal] = np.where(self.sees(nodes[:, None], nodes[None]), apart, np.inf)
+        ways[goal, :goal] = np.where(self.sees(nodes, target), np.linalg.norm(nodes - target, axis=-1), np.inf)
+        distance, before = dijkstra(csgraph_from_dense(ways, null_value=np.inf), indices=goal, return_predecessors=True)
+        return distance[:goal], np.where((before == goal) | (before < 0), -1, before)[:goal]
 
     def _first_leg(self, points: Points) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """points[P, 2] -> geodesic distance [P] [m] and the first corner on the way [P] (-1: straight to the goal)."""

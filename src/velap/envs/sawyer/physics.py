@@ -96,7 +96,10 @@ class Box:
 
 
 class SawyerTask(PixelTask):
-    """An arm before objects whose places are the context of the episode. A subclass says what stands there, and what for."""
+    """An arm before objects whose places are the context of the episode.
+
+    A subclass says what stands there, and is a `ScriptedTask` `WithObjects` (`velap.envs.protocol`).
+    """
 
     joints: ClassVar[tuple[str, ...]]
     """Joints of the objects."""
@@ -132,18 +135,6 @@ class SawyerTask(PixelTask):
     @abstractmethod
     def _sample_start(self, rng: np.random.Generator, split: str) -> Vector:
         """A hand position [3] [m] of the split; called again where the hand would touch something."""
-
-    @abstractmethod
-    def in_test_region(self, position: Vector | None = None) -> bool:
-        """Could a test episode start at hand position[3] [m] (by default the present one), the objects being as they are?"""
-
-    @abstractmethod
-    def expert_distance(self) -> float:
-        """How far the hand is from what the expert acts on in the data [m]; infinite where the data hold no expert."""
-
-    @abstractmethod
-    def expert_action(self) -> NDArray[np.float32]:
-        """The scripted expert's action [4] in the present state."""
 
     def _start(self, rng: np.random.Generator, split: str, context: int | None) -> None:
         mujoco.mj_setState(self.model, self.data, self._home, _STATE)
@@ -200,10 +191,6 @@ class SawyerTask(PixelTask):
         joints = [float(self.data.joint(name).qpos[0]) for name in self.joints]
         places = [value for name in self.placed for value in self.model.body(name).pos[:2]]
         return np.array([*self.agent_position(), *joints, *places, self.data.joint("r_close").qpos[0]], np.float32)
-
-    @abstractmethod
-    def objects(self) -> NDArray[np.float64]:
-        """What an episode is about moving: the places of handles and buttons [K, 3] [m]."""
 
     def mocap_position(self) -> Vector:
         """Where the hand is pulled to [3] [m]."""

@@ -48,9 +48,9 @@ class _NearOrAnywhere(SawyerTask):
         near = rng.random() < self.near_share
         return (self.hand_limits.around(self.handle(), self.near_box) if near else self.hand_limits).sample(rng)
 
-    def in_test_region(self, position: Vector | None = None) -> bool:
+    def in_test_region(self) -> bool:
         """Inside the box of the test starts?"""
-        return self.test_starts.contains(self.agent_position() if position is None else position)
+        return self.test_starts.contains(self.agent_position())
 
     def objects(self) -> NDArray[np.float64]:
         """The handle [1, 3] [m]."""
@@ -219,9 +219,9 @@ class ButtonWall(SawyerTask):
         x, (aside, y_from, y_to) = self.model.body("wall").pos[0], self.lee
         return Box((x - aside, y_from, 0.08), (x + aside, y_to, 0.15))
 
-    def in_test_region(self, position: Vector | None = None) -> bool:
+    def in_test_region(self) -> bool:
         """In the lee of the wall?"""
-        return self._test_starts().contains(self.agent_position() if position is None else position)
+        return self._test_starts().contains(self.agent_position())
 
     def succeeded(self) -> bool:
         """Is the button in?"""
@@ -313,9 +313,9 @@ class DrawerButton(_NearOrAnywhere):
         """What the present subtask is about: the drawer's handle or the button [3] [m]."""
         return self.drawer_handle() if self._subtask == "drawer" else self.button()
 
-    def in_test_region(self, position: Vector | None = None) -> bool:
+    def in_test_region(self) -> bool:
         """In the box of the test starts, with the drawer open?"""
-        return super().in_test_region(position) and not self.drawer_closed()
+        return super().in_test_region() and not self.drawer_closed()
 
     def succeeded(self) -> bool:
         """Is the drawer closed and the button in, both now?"""

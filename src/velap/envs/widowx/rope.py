@@ -190,10 +190,9 @@ class Rope(WidowXTask):
         places = np.concatenate([self.pole()[:2], self.region()[:2]])
         return np.concatenate([self.agent_position(), [self.command()[1]], self.points().ravel(), places]).astype(np.float32)
 
-    def in_test_region(self, position: Vector | None = None) -> bool:
+    def in_test_region(self) -> bool:
         """Is the hand near the region and the rope still wrapped?"""
-        hand = self.agent_position() if position is None else position
-        return bool(np.hypot(*(hand - self.region())[:2]) < 0.09) and self.sweep() < np.radians(-180)
+        return bool(np.hypot(*(self.agent_position() - self.region())[:2]) < 0.09) and self.sweep() < np.radians(-180)
 
     def expert_distance(self) -> float:
         """The way of the held end round the pole to the region, at least the straight one [m]."""

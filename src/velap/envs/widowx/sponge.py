@@ -92,10 +92,9 @@ class Sponge(WidowXTask):
         """Is the sponge's centre over the region?"""
         return bool(np.abs(self.sponge()[:2] - REGION).max() <= REGION_HALF)
 
-    def in_test_region(self, position: Vector | None = None) -> bool:
+    def in_test_region(self) -> bool:
         """Is the sponge far from the region and the hand between them?"""
-        hand = self.agent_position() if position is None else position
-        (low, high), sponge = _SPONGES["test"], self.sponge()[:2]
+        hand, (low, high), sponge = self.agent_position(), _SPONGES["test"], self.sponge()[:2]
         far = bool(((sponge >= low - 0.005) & (sponge <= high + 0.005)).all())
         return far and bool(((hand >= _TEST_HANDS[0] - 0.005) & (hand <= _TEST_HANDS[1] + 0.005)).all())
 

@@ -74,6 +74,8 @@ def scene_xml(view: View, bodies: str, equality: str = "") -> str:
 class WidowXTask(PixelTask):
     """The arm before something to move. A subclass says what lies there, where episodes start and when they succeed.
 
+    It is a `ScriptedTask` (`velap.envs.protocol`).
+
     Actions [4]: displacement of the end effector along x, y and z, and rotation about the vertical.
     """
 
@@ -106,18 +108,6 @@ class WidowXTask(PixelTask):
     @abstractmethod
     def _sample_start(self, rng: np.random.Generator, split: str) -> tuple[Vector, float]:
         """A free pose of the end effector in the present context: position [3] [m] and rotation [rad]."""
-
-    @abstractmethod
-    def in_test_region(self, position: Vector | None = None) -> bool:
-        """Could a test episode start with the hand at position[3] [m], by default the present one, and all else as it is?"""
-
-    @abstractmethod
-    def expert_distance(self) -> float:
-        """How far the task is from done [m]; infinite where the data hold no expert."""
-
-    @abstractmethod
-    def expert_action(self) -> NDArray[np.float32]:
-        """The scripted expert's action [4] in the present state."""
 
     @abstractmethod
     def region(self) -> Vector:

@@ -22,7 +22,6 @@ from velap.report.diagnose import figures
 from velap.report.diagnose.failures import Failures, watch
 from velap.report.diagnose.model import (
     ActionValues,
-    RealStates,
     Recorded,
     RolloutError,
     StatePairs,
@@ -37,8 +36,8 @@ from velap.report.diagnose.model import (
 )
 from velap.report.diagnose.plans import Starts, Trees, diagnose_trees
 from velap.report.diagnose.text import checks, page
-from velap.report.diagnose.world import Scene, expert_curves, first_states, has_layout, look_at_scene, scenery
-from velap.report.figures import can_probe
+from velap.report.diagnose.world import Scene, expert_curves, first_states, has_layout, look_at_scene
+from velap.report.figures import RealStates, can_probe, probe, strip_figure
 from velap.runs import only_writer, write_atomic
 from velap.tasks import TASKS, get_task, task_of
 from velap.training.diagnostics import horizons
@@ -106,8 +105,6 @@ class Diagnosis:
     scenes: tuple[Scene, ...]
     trees: Trees
     failures: Failures | None
-    pictures: tuple[str, ...]
-    """Names of the pictures, in the order of the page; the last one belongs to its end."""
 
 
 class _Subject(NamedTuple):
@@ -174,8 +171,8 @@ def run_diagnose(console: Console, request: Request) -> Diagnosis:
     with only_writer(out, "a diagnosis"):
         diagnosis = _measure(console, request, subject, model, config, recorded, player)
         with console.status("drawing"):
-            _draw(diagnosis, out)
-        write_atomic(out / PAGE, page(diagnosis).encode())
+            pictures = _draw(diagnosis, out)
+        write_atomic(out / PAGE, page(diagnosis, pictures).encode())
     for each in checks(diagnosis):
         console.print(f"{each.mark:>4}  {each.title}: {each.numbers}", markup=False, soft_wrap=True)
     console.print(f"report {out / PAGE}, {time.monotonic() - began:.0f} s", markup=False, soft_wrap=True)
@@ -196,13 +193,12 @@ def _measure(console: Console, request: Request, subject: _Subject, model: Laten
     with console.status("plans"):
         seeds = range(request.first_seed, request.first_seed + len(starts.labels))
         trees = diagnose_trees(model, config, starts, seeds=seeds, real_states=real_states, scenery=world.scenery,
-                               held_out=held_out, one_step=rollout.one_step)
+                               held_out=held_out.cpu().numpy(), one_step=rollout.one_step)
     curves = world.curves or tuple(rewarded_curves(model, recorded))
     failures = None
     if player is not None:
         with console.status(f"{request.episodes} episodes at once"):
             failures = watch(player, range(request.first_seed, request.first_seed + request.episodes), recorded.fastest)
-    pictures = ["model.png", *(["values.png"] if curves else []), *(["scenes.png"] if world.scenes else []), "plan.png"]
     return Diagnosis(
         subject=subject.name,
         command=request.command,
@@ -217,8 +213,7 @@ def _measure(console: Console, request: Request, subject: _Subject, model: Laten
         actions=action_values(model, recorded, held_out),
         scenes=world.scenes,
         trees=trees,
-        failures=failures,
-        pictures=(*pictures, *(["failure.png"] if failures is not None else [])))
+        failures=failures)
 
 
 class _World(NamedTuple):
@@ -243,7 +238,7 @@ def _look_at_world(console: Console, request: Request, model: LatentModel, playe
             if has_layout(env):
                 scenes = [look_at_scene(model, env, read, frame_stack, seed) for seed in seeds[:SCENES]]
             if can_probe(env):
-                around = scenery(model, env, read, frame_stack, seeds[0])
+                around = probe(model, env, read, frame_stack=frame_stack, rng=np.random.default_rng(seeds[0]), seed=seeds[0])
         return _World(first_states(player, env, seeds), tuple(curves), tuple(scenes), around)
     finally:
         env.close()
@@ -276,13 +271,16 @@ def _left_out(world: _World, player: Player | None) -> tuple[str, ...]:
     return tuple(missing)
 
 
-def _draw(diagnosis: Diagnosis, out: Path) -> None:
-    """Every picture that the page names."""
-    figures.model_figure(out / "model.png", diagnosis.rollout, diagnosis.pairs)
+def _draw(diagnosis: Diagnosis, out: Path) -> list[str]:
+    """Draw all results; names of the pictures."""
+    shown = {"model.png": lambda path: figures.model_figure(path, diagnosis.rollout, diagnosis.pairs)}
     if diagnosis.curves:
-        figures.values_figure(out / "values.png", diagnosis.curves)
+        shown["values.png"] = lambda path: figures.values_figure(path, diagnosis.curves)
     if diagnosis.scenes:
-        figures.scenes_figure(out / "scenes.png", diagnosis.scenes)
-    figures.strip_figure(out / "plan.png", diagnosis.trees.strip)
-    if diagnosis.failures is not None:
-        figures.strip_figure(out / "failure.png", diagnosis.failures.strip)
+        shown["scenes.png"] = lambda path: figures.scenes_figure(path, diagnosis.scenes)
+    shown["plan.png"] = lambda path: strip_figure(path, diagnosis.trees.strip)
+    if (failures := diagnosis.failures) is not None:
+        shown["failure.png"] = lambda path: strip_figure(path, failures.strip)
+    for name, draw in shown.items():
+        draw(out / name)
+    return list(shown)

@@ -16,7 +16,7 @@ from velap.envs.protocol import Measured, Positioned, WithObjects, WithSubtasks
 from velap.evaluation.evaluate import BATCH, Player
 from velap.evaluation.rollout import Moment
 from velap.methods.tree_agent import TreeAgent
-from velap.report.diagnose.plans import FilmStrip
+from velap.report.figures import FilmStrip
 
 LEFT_START = 5.0
 """An episode left its start once the agent is farther from it than this many of its fastest steps [steps]. ours."""

@@ -1,6 +1,6 @@
 """The pictures of `velap diagnose`; they show results and compute none.
 
-K rollout lengths, T transitions of an episode, L frames of a strip.
+K rollout lengths, T transitions of an episode.
 """
 
 from __future__ import annotations
@@ -13,14 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap.report.diagnose.model import RolloutError, StatePairs, ValueCurve
-from velap.report.diagnose.plans import FilmStrip
 from velap.report.diagnose.world import NEAR, Scene
 from velap.report.figures import SMALLEST_SHOWN, new_figure, save_figure
 
-COLUMNS = 10
-"""Frames of a strip side by side."""
-MOST_FRAMES = 30
-"""Frames of a strip in all; of longer chains some are left out."""
 SHOWN_PAIRS = 3000
 """Points of a scatter plot at most."""
 
@@ -84,21 +79,4 @@ def scenes_figure(path: Path, scenes: Sequence[Scene], seed: int = 0) -> None:
         column[1].scatter(scene.goal_steps, values, s=6, alpha=0.6, linewidths=0)
         column[1].set(title=f"$Q^g$, rho {scene.value_rho:.2f}", xlabel="shortest way to the goal [steps]", ylabel="$Q^g$",
                       yscale="log", ylim=(values.min() / 1.3, 1.3))
-    save_figure(figure, path)
-
-
-def strip_figure(path: Path, strip: FilmStrip) -> None:
-    """Frames in reading order with their captions below."""
-    picked = np.unique(np.linspace(0, len(strip.frames) - 1, min(MOST_FRAMES, len(strip.frames))).astype(int))
-    rows = -(-len(picked) // COLUMNS)
-    columns = min(COLUMNS, max(len(picked), 6))  # a title needs room
-    figure = new_figure(1.5 * columns, 2.05 * rows + 0.5, strip.title)
-    cells = figure.subplots(rows, columns, squeeze=False).flatten()
-    for axes in cells:
-        axes.set_axis_off()
-    for axes, number in zip(cells, picked, strict=False):
-        axes.set_axis_on()
-        axes.imshow(strip.frames[number], interpolation="nearest")
-        axes.set(xticks=[], yticks=[])
-        axes.set_xlabel(strip.captions[number], fontsize=9)
     save_figure(figure, path)

@@ -1,7 +1,6 @@
 """What `velap diagnose` measures on recorded episodes: dynamics, distances by Q^l and values by Q^g; no environment.
 
-F frames of the dataset, S pairs of states, T transitions of an episode, D latent dimensions, P real states,
-N stacked frames, H x W pixels.
+F frames of the dataset, S pairs of states, T transitions of an episode, D latent dimensions, N stacked frames.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from velap.data.minari_io import load_positions
 from velap.data.sampling import WindowSampler
 from velap.errors import ConfigError
 from velap.models.horizon import q_from_steps, steps_from_q
-from velap.models.inference import nearest_row
 from velap.models.velap import LatentModel
+from velap.report.figures import RealStates
 from velap.training.diagnostics import Horizon
 from velap.training.encoding import encode_rows
 from velap.training.loop import HOLDOUT_EPISODES, holdout_episodes
@@ -295,35 +294,11 @@ def action_values(model: LatentModel, recorded: Recorded, latents: Tensor) -> Ac
     return ActionValues(away=values[now], promised=values[now] - taken[now], gained=values[now] - values[now + LED])
 
 
-@dataclass(frozen=True, kw_only=True)
-class RealStates:
-    """Real states: what they look like and where they are in the latent space."""
-
-    source: str
-    latents: Tensor
-    """[P, D]."""
-    frames: NDArray[np.uint8]
-    """[P, H, W, 3]."""
-
-    def nearest(self, latents: Tensor) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-        """Frames [*, H, W, 3] of the states nearest to latents [*, D], and how far they are [*] [latent distance]."""
-        found = nearest_row(self.latents)(latents)
-        distance = (self.latents[found] - latents).norm(dim=-1)
-        return self.frames[found.cpu().numpy()], distance.double().cpu().numpy()
-
-    def spacing(self) -> float:
-        """Mean distance of a state to the nearest other one [latent distance]."""
-        distances = torch.cdist(self.latents, self.latents)
-        return float(distances.fill_diagonal_(torch.inf).amin(1).mean())
-
-
 def real_states_of(model: LatentModel, recorded: Recorded, rng: np.random.Generator, size: int = REAL_STATES) -> RealStates:
     """States of the dataset, drawn uniformly from the episodes that are not looked at where there are others."""
     rows = np.setdiff1d(np.arange(len(recorded.store.frames)), recorded.rows if recorded.held_out else [])
     if len(rows) == 0:
         rows = recorded.rows
     rows = np.sort(rng.choice(rows, min(size, len(rows)), replace=False))
-    return RealStates(
-        source="the dataset",
-        latents=encode_states(model, recorded.sampler, rows),
-        frames=recorded.store.frames[rows])
+    return RealStates(source=f"the dataset {recorded.store.dataset_id}", frames=recorded.store.frames[rows],
+                      latents=encode_states(model, recorded.sampler, rows).cpu().numpy())

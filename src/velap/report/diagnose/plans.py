@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from velap.config import Config
 from velap.methods.provenance import search_of
 from velap.models.horizon import q_from_steps
 from velap.models.velap import LatentModel
-from velap.report.diagnose.model import RealStates
+from velap.report.figures import FilmStrip, RealStates, planned
 from velap.search.types import Plan
 
 
@@ -53,17 +52,6 @@ class TreeNumbers:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FilmStrip:
-    """A chain of latents as the real frames nearest to them."""
-
-    title: str
-    frames: NDArray[np.uint8]
-    """[L, H, W, 3]."""
-    captions: tuple[str, ...]
-    """[L]."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Trees:
     """Plans from all starts."""
 
@@ -81,35 +69,26 @@ class Trees:
     """The plan from the first start."""
 
 
-def grow(model: LatentModel, config: Config, starts: Starts, seeds: Sequence[int]) -> tuple[Tensor, Plan]:
-    """Encode the starts and plan from them, each with the randomness of its seed: latents [B, D] and the plans."""
-    device = next(model.parameters()).device
-    with torch.inference_mode():
-        latents = model.encode(torch.from_numpy(starts.stacks).to(device)).float()
-    return latents, search_of(model, config)(latents, [torch.Generator().manual_seed(seed) for seed in seeds])
-
-
 def tree_numbers(starts: Starts, result: Plan, real_states: RealStates, one_step: float) -> tuple[TreeNumbers, ...]:
     """One entry a start."""
     found = []
     for row, label in enumerate(starts.labels):
-        size = int(result.tree.size[row])
-        values, latents = result.tree.goal_values[row, :size], result.tree.latents[row, :size]
-        rejected = {name: int(count[row]) for name, count in result.rejections._asdict().items()}
+        found_plan = planned(result, row)
+        values = result.tree.goal_values[row, : len(found_plan.latents)]
         found.append(TreeNumbers(
-            start=label, nodes=size, rejected=rejected, start_value=float(values[0]), best_value=float(values.max()),
-            reached_goal=bool(result.reached_goal[row]), waypoints=int(result.length[row]) - 1, cost=float(result.cost[row]),
-            distance=float(real_states.nearest(latents)[1].mean()) / one_step))
+            start=label, nodes=len(values), start_value=float(values[0]), best_value=float(values.max()),
+            rejected={name: int(count[row]) for name, count in result.rejections._asdict().items()},
+            reached_goal=bool(result.reached_goal[row]), waypoints=len(found_plan.path) - 1, cost=float(result.cost[row]),
+            distance=float(real_states.nearest(found_plan.latents)[1].mean()) / one_step))
     return tuple(found)
 
 
 def plan_strip(starts: Starts, result: Plan, real_states: RealStates, one_step: float, row: int = 0) -> FilmStrip:
     """The chosen path from one start: the start frame itself, then what lies nearest to each waypoint."""
-    length = int(result.length[row])
-    nodes = result.nodes[row, :length]
-    values = result.tree.goal_values[row, nodes].double().cpu().numpy()
-    frames, distances = real_states.nearest(result.waypoints[row, :length])
-    frames = frames.copy()
+    chosen = planned(result, row)
+    values = result.tree.goal_values[row, chosen.path].double().cpu().numpy()
+    numbers, distances = real_states.nearest(chosen.waypoints)
+    frames = real_states.frames[numbers]
     frames[0] = starts.stacks[row, -1]
     captions = [f"start\n$Q^g$ {values[0]:.2g}"]
     captions += [f"{number}: {distance / one_step:.1f} off\n$Q^g$ {value:.2g}"
@@ -119,7 +98,7 @@ def plan_strip(starts: Starts, result: Plan, real_states: RealStates, one_step: 
 
 
 def diagnose_trees(model: LatentModel, config: Config, starts: Starts, *, seeds: Sequence[int], real_states: RealStates,
-                   scenery: RealStates | None, held_out: Tensor, one_step: float) -> Trees:
+                   scenery: RealStates | None, held_out: NDArray[np.float32], one_step: float) -> Trees:
     """Plan from all starts and compare the nodes with real states.
 
     Args:
@@ -132,11 +111,13 @@ def diagnose_trees(model: LatentModel, config: Config, starts: Starts, *, seeds:
         held_out: [R, D] states that were recorded and are not among `real_states`.
         one_step: mean distance of subsequent encodings [latent distance].
     """
-    _, result = grow(model, config, starts, seeds)
+    with torch.inference_mode():
+        latents = model.encode(torch.from_numpy(starts.stacks).to(next(model.parameters()).device)).float()
+    result = search_of(model, config)(latents, [torch.Generator().manual_seed(seed) for seed in seeds])
     scene_distance = spacing = None
     if scenery is not None:
-        first = result.tree.latents[0, : int(result.tree.size[0])]
-        scene_distance, spacing = float(scenery.nearest(first)[1].mean()) / one_step, scenery.spacing() / one_step
+        distances = scenery.nearest(planned(result, 0).latents)[1]
+        scene_distance, spacing = float(distances.mean()) / one_step, scenery.spacing() / one_step
     return Trees(
         numbers=tree_numbers(starts, result, real_states, one_step),
         held_out_distance=float(real_states.nearest(held_out)[1].mean()) / one_step,

@@ -217,8 +217,8 @@ def _numbers(values: Sequence[float], digits: int = 2) -> str:
     return " / ".join("-" if math.isnan(value) else f"{value:.{digits}f}" for value in values)
 
 
-def page(diagnosis: Diagnosis) -> str:
-    """The report, in Markdown."""
+def page(diagnosis: Diagnosis, pictures: Sequence[str]) -> str:
+    """The report, in Markdown; the last picture stands at its end."""
     lines = [f"# Diagnosis of {diagnosis.subject}", "", f"Written by `{diagnosis.command}`. {diagnosis.origin}", ""]
     lines += [f"Left out: {text}\n" for text in diagnosis.left_out]
     lines += [f"- {each.mark} **{each.title}**: {each.numbers}. *Expected*: {each.expected}. *Otherwise*: {each.advice}."
@@ -226,10 +226,10 @@ def page(diagnosis: Diagnosis) -> str:
     lines += ["", "Faults spread downwards: mend the first `LOOK` first. One-step length: mean distance of subsequent "
               f"encodings, {diagnosis.rollout.one_step:.3g}. Q-values are read as steps by log_γ; the bounds are rules of "
               "thumb.", ""]
-    lines += [f"![{name}]({name})" for name in diagnosis.pictures[:-1]] + ["", *_tree_table(diagnosis.trees)]
+    lines += [f"![{name}]({name})" for name in pictures[:-1]] + ["", *_tree_table(diagnosis.trees)]
     if diagnosis.failures is not None:
         lines += ["", *_failure_table(diagnosis.failures)]
-    return "\n".join([*lines, "", f"![{diagnosis.pictures[-1]}]({diagnosis.pictures[-1]})", ""])
+    return "\n".join([*lines, "", f"![{pictures[-1]}]({pictures[-1]})", ""])
 
 
 def _tree_table(trees: Trees) -> list[str]:

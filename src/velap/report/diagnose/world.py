@@ -22,7 +22,7 @@ from velap.envs.protocol import Expert, Mapped, Walled
 from velap.evaluation.evaluate import Player, reset_options
 from velap.evaluation.rollout import FrameReader, play_without_frames
 from velap.models.velap import LatentModel
-from velap.report.diagnose.model import RealStates, ValueCurve, local_steps, rank_correlation, value_curve
+from velap.report.diagnose.model import ValueCurve, local_steps, rank_correlation, value_curve
 from velap.report.diagnose.plans import Starts
 from velap.report.figures import probe
 
@@ -107,15 +107,6 @@ def look_at_scene(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader,
         values=seen.values[reachable].astype(np.float64),
         pair_steps=pair_steps[known],
         pair_local=pair_local[known])
-
-
-def scenery(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader, frame_stack: int, seed: int) -> RealStates:
-    """Real states of the scene of that test seed."""
-    seen = probe(model, env, read, frame_stack=frame_stack, rng=np.random.default_rng(seed), seed=seed)
-    return RealStates(
-        source="the same scene",
-        latents=torch.from_numpy(seen.latents).to(next(model.parameters()).device),
-        frames=seen.frames)
 
 
 def stack_all(frames: Sequence[NDArray[np.uint8]], frame_stack: int) -> NDArray[np.uint8]:
