@@ -356,7 +356,7 @@ def tensors_digest(path: Path) -> str:
 
 def record_identities(task: str, method: str) -> set[tuple[str, str]]:
     """(config hash, checkpoint hash) in the committed records of a method."""
-    path = record_path(REPOSITORY / "results/records", task, method, "default", 0)
+    path = record_path(REPOSITORY / "results/records-five-recipes", task, method, "default", 0)
     return {(record.config_hash, record.checkpoint) for record in read_records(path)}
 
 

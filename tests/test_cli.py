@@ -29,6 +29,7 @@ from velap.models.velap import LatentModel, Spaces
 from velap.tasks import TASKS, make_config
 
 ROOT = Path(__file__).resolve().parents[1]
+OLD_RECORDS = ROOT / "results/records-five-recipes"
 RANDOM = ["evaluate", "SpiralMaze", "--method", "random", "--max-steps", "4"]
 
 
@@ -344,7 +345,7 @@ def test_where_every_step_costs_success_has_to_be_said(mine: list[str], capsys: 
 def test_own_records_never_meet_the_shipped_ones(tmp_path: Path) -> None:
     shipped = Path("results/records/SpiralMaze/velap-default/train3.jsonl")
     shipped.parent.mkdir(parents=True)
-    shipped.write_bytes((ROOT / "results/records/SpiralMaze/velap-default/train0.jsonl").read_bytes())
+    shipped.write_bytes((OLD_RECORDS / "SpiralMaze/velap-default/train0.jsonl").read_bytes())
     before = shipped.read_bytes()
     assert cli.main(["evaluate", "SpiralMaze", "--episodes", "1", "--max-steps", "3", "--checkpoint",
                      str(untrained(tmp_path / "a.safetensors"))]) == 0
@@ -394,7 +395,7 @@ def test_a_setting_without_a_value_is_named(capsys: pytest.CaptureFixture[str]) 
 def test_the_table_of_all_records_has_whole_names_in_a_log_file(monkeypatch: pytest.MonkeyPatch,
                                                                 capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("COLUMNS", "40")
-    assert cli.main(["table", "--records", str(ROOT / "results/records")]) == 0
+    assert cli.main(["table", "--records", str(OLD_RECORDS)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any("ButtonWall" in line and "bc-success" in line and "95 % interval" not in line for line in lines)
     assert len({line.count("|") for line in lines}) == 1, "one line a run"
@@ -402,8 +403,8 @@ def test_the_table_of_all_records_has_whole_names_in_a_log_file(monkeypatch: pyt
 
 @pytest.mark.parametrize(("command", "text"), [
     (["evaluate", "SpiralMaze", "--method", "random", "--first-seed", "-1", "--episodes", "1"], "first episode seed -1"),
-    (["table", "--records", str(ROOT / "results/records"), "--write", "new.md"], "new.md has no place for the table"),
-    (["table", "--records", str(ROOT / "results/records"), "--write", "."], "has no place for the table"),
+    (["table", "--records", str(OLD_RECORDS), "--write", "new.md"], "new.md has no place for the table"),
+    (["table", "--records", str(OLD_RECORDS), "--write", "."], "has no place for the table"),
     (["table"], "no records below runs/records"),
     (["evaluate", "SpiralMaze", "--method", "random", "--episodes", "0"], "got 0 episodes"),
     (["evaluate", "SpiralMaze", "--method", "random", "--episodes", "1", "--max-steps", "0"], "Give one with --max-steps"),
@@ -421,7 +422,7 @@ def test_wrong_input_is_one_paragraph(command: list[str], text: str, capsys: pyt
 def test_a_run_does_not_train_where_its_records_would_be_refused(capsys: pytest.CaptureFixture[str]) -> None:
     path = Path("runs/records/SpiralMaze/velap-default/train0.jsonl")
     path.parent.mkdir(parents=True)
-    path.write_bytes((ROOT / "results/records/SpiralMaze/velap-default/train0.jsonl").read_bytes())
+    path.write_bytes((OLD_RECORDS / "SpiralMaze/velap-default/train0.jsonl").read_bytes())
     assert cli.main(["run", "SpiralMaze", "--set", "planner.n_iter=7"]) == 2
     assert "holds records of another config" in capsys.readouterr().err
     assert not Path("runs/SpiralMaze").exists() and not Path("datasets").exists()

@@ -30,6 +30,7 @@ from studies.table1.cells import (
     parse_only,
     training_seconds,
 )
+from studies.table1.page import results_page
 from studies.table1.paper import METHODS, TABLE_1
 from studies.table1.workflow import to_do
 from velap import cli
@@ -248,6 +249,13 @@ def test_what_is_left_out_or_mixed_is_named() -> None:
     assert f"{two} holds episodes of 2 versions of the code: 0.1.0+gabc, 0.1.0+gdef." in notes
     assert ("SpiralMaze default seed 0: the methods do not share one joint checkpoint: aaaaaaaaaaaa td3bc; "
             "bbbbbbbbbbbb mppi.") in notes
+
+
+def test_where_nothing_is_measured_no_cell_has_a_number() -> None:
+    results = tables.gather(RECORDS, 4)
+    assert set(tables.matrix(results.of("default")).to_numpy().ravel()) == {"–"}
+    assert f"{len(parse_only())} of {len(parse_only())} cells of preset default are not measured." in results.notes
+    assert "## VELAP against" not in results_page(results, 4)
 
 
 def test_the_page_and_the_files_are_written_from_the_records(capsys: pytest.CaptureFixture[str]) -> None:

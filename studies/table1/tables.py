@@ -21,7 +21,7 @@ from velap.models.checkpoint import WEIGHTS_SHA256, shared_weights
 from velap.tasks import PRESETS
 
 MISSING = "–"
-"""A cell without records."""
+"""What was not measured."""
 NO_BASELINES = ("velap", "random")
 """Methods that are not among those that VELAP is compared with."""
 KEY = ["task", "method", "preset"]
@@ -38,7 +38,7 @@ class Results:
 
     runs: pd.DataFrame
     """A row a training seed, and one without numbers for each cell that has no records; columns `CSV_COLUMNS`, `plans`,
-    `led_by_plan` [%], `schema` and `outcomes`."""
+    `led_by_plan` [%] and `outcomes`."""
     notes: tuple[str, ...]
     """What was left out, and what is mixed."""
 
@@ -61,7 +61,7 @@ def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> 
             for method in METHOD_ORDER:
                 found = list(_runs(Cell(task, method, preset, 0), root, episodes, notes))
                 rows += found or [dict(zip(KEY, (task, method, preset), strict=True))]
-    runs = pd.DataFrame(rows, columns=[*CSV_COLUMNS, "plans", "led_by_plan", "schema", "outcomes"])
+    runs = pd.DataFrame(rows, columns=[*CSV_COLUMNS, "plans", "led_by_plan", "outcomes"])
     recorded = set(runs[runs["episodes"].notna()]["preset"])
     runs = runs[runs["preset"].isin(recorded | set(presets))].copy()
     for number, row in runs.iterrows():
@@ -73,7 +73,7 @@ def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> 
     whole = ["train_seed", "episodes", "successes", "seeds", "paper_percent", "paper_deviation_percent"]
     real = [name for name in (*NUMBERS, *SPREAD, *COST) if name not in whole]
     runs = runs.astype(dict.fromkeys(whole, "Int64") | dict.fromkeys(real, float))
-    return Results(runs, (*notes, *_batches(runs), *_mixed_code(runs), *_mixed_checkpoints(runs), *_missing(runs)))
+    return Results(runs, (*notes, *_mixed_code(runs), *_mixed_checkpoints(runs), *_missing(runs)))
 
 
 def _runs(cell: Cell, root: Path, episodes: int, notes: list[str]) -> Iterator[dict[str, Any]]:
@@ -95,8 +95,7 @@ def _runs(cell: Cell, root: Path, episodes: int, notes: list[str]) -> Iterator[d
             "mean_steps": summary.mean_steps, "plan_ms_p50": summary.plan_ms_p50, "plan_ms_p95": summary.plan_ms_p95,
             "training_seconds": training_seconds(run), "config_hash": records[0].config_hash,
             "checkpoint": records[0].checkpoint, "code_versions": " ".join(summary.code_versions), "records": str(path),
-            "plans": summary.mean_plans,
-            "led_by_plan": 100 * summary.plan_share, "schema": min(record.schema for record in records),
+            "plans": summary.mean_plans, "led_by_plan": 100 * summary.plan_share,
             "outcomes": {(run.seed, record.episode_seed): record.success for record in records}}
 
 
@@ -200,21 +199,15 @@ def _outcomes(runs: pd.DataFrame, method: str) -> Episodes:
     return {key: won for outcomes in runs[runs["method"] == method]["outcomes"] for key, won in outcomes.items()}
 
 
-def _batches(runs: pd.DataFrame) -> Iterator[str]:
-    """VELAP's records from before rows became independent."""
-    old = runs[(runs["method"] == "velap") & (runs["schema"] == 1)]
-    if len(old):
-        yield (f"{len(old)} record files of VELAP do not name their batch. They were made in batches of 10 to 25 by code in "
-               "which an episode of VELAP depended on the others of its batch; commit b52d38f mended that.")
-
-
 def _mixed_code(runs: pd.DataFrame) -> Iterator[str]:
     """Files whose episodes come from several versions of the code, or from changes that no commit holds."""
     recorded = runs[runs["episodes"].notna()]
-    for path, versions in zip(recorded["records"], recorded["code_versions"].str.split(), strict=True):
-        if len(versions) > 1:
-            yield f"{path} holds episodes of {len(versions)} versions of the code: {', '.join(versions)}."
-    dirty = list(recorded[recorded["code_versions"].str.contains(r"\.dirty", na=False)]["records"])
+    versions_of = dict(zip(recorded["records"], recorded["code_versions"], strict=True))
+    for path, versions in versions_of.items():
+        if " " in versions:
+            yield (f"{path} holds episodes of {len(versions.split())} versions of the code: "
+                   f"{', '.join(versions.split())}.")
+    dirty = [path for path, versions in versions_of.items() if ".dirty" in versions]
     if dirty:
         yield (f"{len(dirty)} files were recorded, wholly or in part, with uncommitted changes of the code: "
                f"{', '.join(dirty)}.")
@@ -248,9 +241,9 @@ def _shared(cell: Cell, checkpoint: str) -> str:
 
 
 def _missing(runs: pd.DataFrame) -> Iterator[str]:
-    """How many cells of each preset are empty."""
+    """How many cells of each preset have no records."""
     for preset, group in runs.groupby("preset", sort=False):
         empty = int((group["seeds"] == 0).sum())
         if empty:
             total = len(group.drop_duplicates(KEY))
-            yield f"{empty} of {total} cells of preset {preset} are missing."
+            yield f"{empty} of {total} cells of preset {preset} are not measured."

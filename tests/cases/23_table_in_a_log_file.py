@@ -2,5 +2,5 @@
 
 from case import CHECKOUT, run, verdict
 
-code, text = run("table", "--records", CHECKOUT / "results/records")
+code, text = run("table", "--records", CHECKOUT / "results/records-five-recipes")
 verdict("bc-success" in text and "ButtonWall" in text, "whole names where the output is no terminal")

@@ -4,7 +4,7 @@ from case import CHECKOUT, run, verdict
 
 import velap
 
-records = ["--records", CHECKOUT / "results/records"]
+records = ["--records", CHECKOUT / "results/records-five-recipes"]
 random = ["evaluate", "SpiralMaze", "--method", "random", "--episodes", 1]
 tries = {"long id": ["train", "--dataset", "a" * 260 + "-v0"],
          "negative seed": [*random, "--first-seed", -1, "--records", "rec"],
