@@ -9,6 +9,7 @@ import json
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,16 +45,18 @@ class Benchmark:
 
 BENCHMARKS: dict[str, Benchmark] = {
     "train_frames_per_s": Benchmark(benchmarks.train_frames_per_s, at_least=0.8),
-    "train_frames_per_s_stack3": Benchmark(benchmarks.train_frames_per_s_stack3, at_least=0.8),
+    "train_frames_per_s_stack3": Benchmark(partial(benchmarks.train_frames_per_s, frame_stack=3), at_least=0.8),
     "train_minutes": Benchmark(benchmarks.train_minutes),
-    "plan_latency_1": Benchmark(benchmarks.plan_latency_1, at_most=1 / 50),
-    "plan_latency_1_sim10": Benchmark(benchmarks.plan_latency_1_sim10, at_most=1 / 50),
-    "plan_latency_64": Benchmark(benchmarks.plan_latency_64, at_most=1 / 50),
-    "env_steps_per_s": Benchmark(benchmarks.env_steps_per_s, at_least=10),
-    "sawyer_env_steps_per_s": Benchmark(benchmarks.sawyer_env_steps_per_s, at_least=10),
+    "plan_latency_1": Benchmark(partial(benchmarks.plan_latency, batch=1, repeats=9), at_most=1 / 50),
+    "plan_latency_1_sim10": Benchmark(partial(benchmarks.plan_latency, batch=1, repeats=9, n_sim=10), at_most=1 / 50),
+    "plan_latency_64": Benchmark(partial(benchmarks.plan_latency, batch=64, repeats=3), at_most=1 / 50),
+    "env_steps_per_s": Benchmark(partial(benchmarks.env_steps_per_s, name="SpiralMaze"), at_least=10),
+    "sawyer_env_steps_per_s": Benchmark(partial(benchmarks.env_steps_per_s, name="WindowClose"), at_least=10),
     "collect_frames_per_s": Benchmark(benchmarks.collect_frames_per_s, at_least=1),
     "train_rss": Benchmark(benchmarks.train_rss, at_most=1),
 }
+"""Three stacked frames are the default of other tasks; expansions of 10 steps are Table 8's for SpiralMaze, ButtonWall and
+DrawerButton, 5 for the others."""
 
 
 def machine(device: torch.device) -> str:
