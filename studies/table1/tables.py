@@ -67,9 +67,7 @@ def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> 
     for number, row in runs.iterrows():
         rates = runs[(runs[KEY] == row[KEY]).all(axis=1)]["success_percent"].dropna()
         mean, spread = mean_and_spread(list(rates)) if len(rates) else (None, None)
-        paper = TABLE_1.get((row["task"], row["method"]))
-        reported = (None, None) if paper is None else (paper.mean, paper.deviation)
-        runs.loc[number, SPREAD] = [len(rates), mean, spread, *reported]
+        runs.loc[number, SPREAD] = [len(rates), mean, spread, *TABLE_1.get((row["task"], row["method"]), (None, None))]
     whole = ["train_seed", "episodes", "successes", "seeds", "paper_percent", "paper_deviation_percent"]
     real = [name for name in (*NUMBERS, *SPREAD, *COST) if name not in whole]
     runs = runs.astype(dict.fromkeys(whole, "Int64") | dict.fromkeys(real, float))
@@ -117,8 +115,7 @@ def success(runs: pd.DataFrame) -> str:
 
 def published(task: str, method: str) -> str:
     """`94 ± 3` [%] of the paper; a dash for methods that it does not have."""
-    cell = TABLE_1.get((task, method))
-    return MISSING if cell is None else f"{cell.mean} ± {cell.deviation}"
+    return "{} ± {}".format(*TABLE_1[task, method]) if (task, method) in TABLE_1 else MISSING
 
 
 def matrix(runs: pd.DataFrame) -> pd.DataFrame:

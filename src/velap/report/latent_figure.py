@@ -17,14 +17,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from velap.data.frames import Reading
-from velap.data.loading import load_store
 from velap.data.sampling import WindowSampler
 from velap.envs.protocol import Mapped
 from velap.errors import DatasetError
 from velap.evaluation.evaluate import Evaluation, load_player, make_env
 from velap.methods.states import StateEncoder
 from velap.models.checkpoint import load_checkpoint, released_checkpoint
+from velap.report.diagnose.model import load_as_trained
 from velap.report.figures import (
     PROBES,
     draw_path,
@@ -291,11 +290,8 @@ def spaces_of(task: str, checkpoint: Path | None, dataset: str | None, image_key
         return [of_env(player, f"{task}, layout {number}", {"split": "test", "context": context})
                 for number, context in enumerate(layouts, start=1)]
     model, config, metadata = load_checkpoint(path, pick_device(device))
-    reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else Reading()
     source = dataset or (TASKS[task].dataset_id if task in TASKS else task)
-    store = load_store(source, image_key or reading.image_key or None, image_size=model.spaces.height, fit=reading.fit,
-                       success=reading.success or None)
-    return [of_data(model, config, task, store)]
+    return [of_data(model, config, task, load_as_trained(source, image_key, model, metadata))]
 
 
 def show(console: Console, task: str | None, *, checkpoint: Path | None = None, dataset: str | None = None,
