@@ -1,5 +1,4 @@
-"""The benchmarks of `velap bench`, one function each: both sides measured in one run, in turns, so that a slow moment of the
-machine hits both.
+"""The benchmarks of `velap bench`, one function each: both sides run in turns, so that slow moments hit both.
 """
 
 from __future__ import annotations
@@ -41,9 +40,9 @@ TASK = "SpiralMaze"
 DATASET = "bench/synthetic-v0"
 GIB = 2**30
 PLANS_A_TURN = 8
-"""Plans for one environment between two of MPPI, whose threads go on spinning for some milliseconds after it."""
+"""Plans for one environment in a turn: MPPI's threads keep spinning for some milliseconds after its turn."""
 MPPI_BATCH = 8
-"""Environments that MPPI plans for at once; its 1000 samples a row make larger batches no faster a row."""
+"""Environments that MPPI plans for at once; larger batches are no faster a row."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Measurement:
     unit: str
     reference_name: str
     reference_value: float | None
-    """In the same unit; None where the reference cannot run here."""
+    """In the same unit; None if the reference cannot run here."""
 
     @property
     def ratio(self) -> float | None:
@@ -128,14 +127,14 @@ def training_minutes(trainer: Trainer, warm: int = 16, count: int = 200, most: f
 
 
 def _now(device: torch.device) -> float:
-    """Seconds of a clock, once the device has done what it was given."""
+    """Time after all work of the device has finished [s]."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def train_frames_per_s(device: torch.device, frame_stack: int | None = None) -> Measurement:
-    """SpiralMaze's joint updates against the forward and backward pass of the encoder alone on frames that lie ready.
+    """SpiralMaze's joint updates against the encoder's forward and backward pass alone, on prepared frames.
 
     `frame_stack` is that of the task unless given [frames].
     """
@@ -208,7 +207,7 @@ for line in sys.stdin:
 
 @contextmanager
 def meta_world(backend: str) -> Iterator[Callable[[int], object] | None]:
-    """A function that runs so many steps of WindowClose with 64 × 64 pixels; None without Meta-World."""
+    """A function that runs a number of steps of WindowClose with 64 × 64 pixels; None without Meta-World."""
     environment = {key: value for key, value in os.environ.items() if key != "LP_NUM_THREADS"}
     with subprocess.Popen([sys.executable, "-c", META_WORLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                           stderr=subprocess.DEVNULL, text=True, env={**environment, "MUJOCO_GL": backend}) as child:
@@ -276,7 +275,7 @@ def collect_frames_per_s(device: torch.device) -> Measurement:
 
 @contextmanager
 def _datasets_in(folder: str) -> Iterator[None]:
-    """Minari's datasets lie in `folder` for a while."""
+    """Put Minari's datasets into `folder`."""
     key = "MINARI_DATASETS_PATH"
     before = os.environ.get(key)
     os.environ[key] = folder
@@ -323,7 +322,7 @@ def print_peak(run_dir: str, device: str) -> None:
 
 
 def peak_memory() -> int:
-    """Largest resident memory of this process so far [bytes]. Its program alone: getrusage counts what forked it as well."""
+    """Largest resident memory of this process so far [bytes]; getrusage would include the process that forked it."""
     import resource
 
     status = Path("/proc/self/status")

@@ -27,7 +27,7 @@ from velap.training.loop import pick_device
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A registered benchmark and the ratio it is to reach."""
+    """A registered benchmark and the bound of its ratio."""
 
     measure: Callable[[torch.device], Measurement]
     at_least: float | None = None
@@ -60,7 +60,7 @@ DrawerButton, 5 for the others."""
 
 
 def machine(device: torch.device) -> str:
-    """What the numbers were measured on."""
+    """The machine of the measurements."""
     gpu = f", {torch.cuda.get_device_name(device)}" if device.type == "cuda" else ""
     return (f"{hardware()}, {torch.get_num_threads()} threads{gpu}, "
             f"torch {torch.__version__}, Python {platform.python_version()}, {platform.system()}")
@@ -97,7 +97,7 @@ def run_benchmarks(console: Console, json_path: Path | None = None, device: str 
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
-    """Rows of an earlier run; those of other benchmarks stay when only some are measured."""
+    """Rows of an earlier run, which are kept for benchmarks that are not measured now."""
     if not path.exists():
         return []
     try:

@@ -1,4 +1,4 @@
-"""`velap view`: what an agent did in an episode, step by step, and real states to compare its latents with.
+"""`velap view`: the decisions of an agent in one episode, and real states to compare its latents with.
 
 T steps of an episode, D latent dimensions.
 """
@@ -27,24 +27,24 @@ from velap.search.types import Plan
 from velap.tasks import TASKS
 
 FIRST_SEED = 1000
-"""Episode that is shown unless said: the first validation seed."""
+"""Default episode: the first validation seed."""
 SIDE = 256
 """Side of the pictures of the world [px]."""
 STATES = 1200
 """Real states in the map at most. ours: enough to see a maze's corridors, and some seconds of Isomap."""
 
 GOAL, PLAN, LEADER, NOWHERE = "goal", "plan", "leader", "nowhere"
-"""Who acts in a step: π^g near the goal, π^l along a plan, a leader, or π^g where the plan leads nowhere."""
+"""Who acts in a step: π^g near the goal, π^l along a plan, a leader, or π^g with a plan of the root alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MadePlan(Planned):
-    """A plan, and when it was made."""
+    """A plan, and when and how it was made."""
 
     step: int
     """Step that it was made at."""
     reached_goal: bool | None
-    """Some node has Q^g > τ_goal; None where the planner does not tell."""
+    """Some node has Q^g > τ_goal; None for planners without a tree."""
     cost: float | None
     """c(g*) [steps]."""
     milliseconds: float
@@ -57,20 +57,20 @@ class Step:
     picture: NDArray[np.uint8]
     """[SIDE, SIDE, 3] the world before the action."""
     latent: NDArray[np.float32] | None
-    """[D]; None for methods that do not tell."""
+    """[D]; None for methods other than VELAP."""
     value: float | None
     """Q^g [Q-value]."""
     actor: str | None
     """One of GOAL, PLAN, LEADER, NOWHERE."""
     waypoint: int | None
-    """Number of the waypoint headed for, from 1 on; None where no plan is followed."""
+    """Number of the current waypoint, from 1; None without a plan to follow."""
     plan: int | None
-    """Number of the plan held."""
+    """Number of the current plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """An episode as it was seen."""
+    """One episode."""
 
     outcome: Episode
     steps: tuple[Step, ...]
@@ -80,7 +80,7 @@ class Trace:
 
 
 class Tracer:
-    """An observer of one episode at a time, in one row, that keeps what the agent tells."""
+    """An observer that keeps the decisions of one episode at a time, in one row."""
 
     def __init__(self) -> None:
         self._steps: list[Step] = []
@@ -89,7 +89,7 @@ class Tracer:
         """Finished episodes."""
 
     def __call__(self, moment: Moment) -> None:
-        """Keep a step, or close the episode."""
+        """Keep a step, or finish the episode."""
         seen = picture(moment, SIDE)
         if moment.outcome is not None:
             self.traces.append(Trace(outcome=moment.outcome, steps=tuple(self._steps), last_picture=seen,
@@ -121,7 +121,7 @@ def _made(agent: VelapAgent, row: int, step: int) -> MadePlan:
 
 
 def trace(player: Player, seed: int) -> Trace:
-    """Run the episode of `seed` and keep it."""
+    """Run the episode of `seed`."""
     tracer = Tracer()
     for _ in player.rollout(1, tracer).run([seed]):
         pass
@@ -129,8 +129,8 @@ def trace(player: Player, seed: int) -> Trace:
 
 
 def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: int = STATES) -> RealStates | None:
-    """Real states: of the dataset where one is named; else of the episode's own scene, where the environment can be put
-    anywhere; else of the task's dataset, where it is here; else the bank of latents in the checkpoint, without frames."""
+    """Real states of the given dataset; else of the episode's own scene if the robot can be placed anywhere; else of the
+    task's dataset if it exists; else the checkpoint's bank of latents, without frames."""
     if player.model is None:
         return None
     rng = np.random.default_rng(0)
@@ -157,21 +157,20 @@ def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: in
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """What is to be viewed."""
+    """An episode to view."""
 
     player: Player
     seed: int
     records: tuple[Record, ...] = ()
-    """Of the file that was named."""
+    """All records of the given file."""
 
 
 def subject_of(source: Path, *, episode_seed: int | None = None, checkpoint: Path | None = None, method: str = "velap",
                env: str | None = None, env_kwargs: dict[str, Any] | None = None, max_steps: int | None = None,
                device: str = "auto") -> Subject:
-    """A checkpoint, or a record file: then an episode of it is run again as it was recorded.
+    """An episode of a checkpoint, or a recorded one that runs again as it was recorded.
 
-    Of a record file the first failed episode is taken unless one is named, and the checkpoint is the task's released one
-    unless one is named.
+    Defaults for a record file: the first failed episode, and the task's released checkpoint.
     """
     if source.suffix != ".jsonl":
         task = load_checkpoint(source)[1].task
@@ -191,7 +190,7 @@ def subject_of(source: Path, *, episode_seed: int | None = None, checkpoint: Pat
 
 
 def _recorded_player(source: Path, key: Record, checkpoint: Path | None, device: str) -> Player:
-    """The player that a record file comes from; raises ConfigError where the checkpoint is another one."""
+    """The player that made a record file; raises ConfigError for another checkpoint."""
     if checkpoint is None and key.checkpoint:
         try:
             checkpoint = released_checkpoint(key.task)
