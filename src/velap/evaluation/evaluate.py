@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from pathlib import Path
@@ -99,11 +99,15 @@ class Player:
         device = next(self.model.parameters()).device
         return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
-    def rollout(self, batch: int, observer: Observer | None = None) -> Rollout:
-        """A rollout over `batch` new environments."""
-        envs = make_envs(self.make_env, batch)
-        return Rollout(envs, self.agent, self.frames_of(envs[0]), reset_options=reset_options(envs[0]),
-                       max_steps=self.key.max_steps, success=self.success, observer=observer)
+    def episodes(self, seeds: Sequence[int], batch: int = BATCH, observer: Observer | None = None) -> Iterator[Episode]:
+        """Run every seed once, up to `batch` at a time; yields episodes in the order of finishing."""
+        envs = make_envs(self.make_env, min(batch, len(seeds)))
+        try:
+            yield from Rollout(envs, self.agent, self.frames_of(envs[0]), reset_options=reset_options(envs[0]),
+                               max_steps=self.key.max_steps, success=self.success, observer=observer).run(seeds)
+        finally:
+            for env in envs:
+                env.close()
 
 
 def reset_options(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
@@ -252,7 +256,7 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
         missing = [seed for seed in seeds if seed not in file.done]
         if missing:
             batch = min(batch, len(missing))
-            for episode in player.rollout(batch).run(missing):
+            for episode in player.episodes(missing, batch):
                 record = to_record(player.key, episode, batch, player.device)
                 file.append(record)
                 on_record(record)
@@ -281,20 +285,18 @@ def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str
     if len(seeds) == 0 or batch < 1:
         raise ConfigError(f"got {len(seeds)} episodes in batches of {batch}; expected at least one of each.")
     env_id = TASKS[env].env_id if env in TASKS else env
-    batch = min(batch, len(seeds))
-    envs = make_envs(lambda: make_env(env_id, env_kwargs), batch)
+    first = make_env(env_id, env_kwargs)
     try:
-        key = RunKey(task=env, method=agent.method, preset="none", train_seed=0, env=env_id, config_hash="", checkpoint="",
-                     code_version=code_version(), env_kwargs=dict(env_kwargs or {}), image_key=image_key,
-                     max_steps=_time_limit(envs[0], max_steps), success_rule=success)
-        rule = None if success is None else Success.parse(success)
-        rollout = Rollout(envs, agent, FrameReader(envs[0], image_size, image_key, None), max_steps=key.max_steps,
-                          reset_options=reset_options(envs[0]), success=rule)
-        return [to_record(key, each, batch, device="")
-                for each in sorted(rollout.run(seeds), key=lambda each: each.seed)]
+        limit = _time_limit(first, max_steps)
     finally:
-        for made in envs:
-            made.close()
+        first.close()
+    key = RunKey(task=env, method=agent.method, preset="none", train_seed=0, env=env_id, config_hash="", checkpoint="",
+                 code_version=code_version(), env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=limit,
+                 success_rule=success)
+    player = Player(agent=agent, model=None, config=Config(task=env, preset="none"), key=key, image_size=image_size,
+                    make_env=lambda: make_env(env_id, env_kwargs))
+    return [to_record(key, each, min(batch, len(seeds)), device="")
+            for each in sorted(player.episodes(seeds, batch), key=lambda each: each.seed)]
 
 
 def to_record(key: RunKey, episode: Episode, batch: int, device: str) -> Record:

@@ -209,15 +209,11 @@ class RecordFile:
                 raise
         self.records.append(record)
 
-    def close(self) -> None:
-        """Release the file and its lock."""
-        self._opened.close()
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self.close()
+        self._opened.close()
 
 
 def _free_name(path: Path) -> Path:

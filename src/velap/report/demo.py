@@ -40,7 +40,7 @@ def run_demo(console: Console, task: str, *, checkpoint: Path | None = None, epi
             recorder(moment)
             view.step(moment.row)
 
-        for episode in player.rollout(episodes, observe).run(range(episodes)):
+        for episode in player.episodes(range(episodes), episodes, observe):
             records.append(to_record(player.key, episode, episodes, player.device))
             view(records[-1])
     summary = summarise(records)

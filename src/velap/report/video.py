@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from velap.methods.velap import VelapAgent
-from velap.report.figures import LatentMap, can_probe, probe, to_pixels
+from velap.report.figures import PROBES, LatentMap, can_probe, probe, to_pixels
 from velap.runs import storage_errors
 
 if TYPE_CHECKING:
@@ -128,15 +128,14 @@ def picture(moment: Moment, size: int) -> NDArray[np.uint8]:
     return np.asarray(image.resize((size, size), Image.Resampling.NEAREST))
 
 
-def latent_map_of(player: Player) -> LatentMap | None:
-    """The latent map of a player's model in its environment; None if the environment cannot be probed."""
+def latent_map_of(player: Player, seed: int = 0, count: int = PROBES) -> LatentMap | None:
+    """Real states of the scene of that seed, by the player's model; None if the environment cannot be probed."""
     env = player.make_env()
     try:
         if player.model is None or not can_probe(env):
             return None
-        reader = player.frames_of(env)
-        return probe(player.model, env, reader, frame_stack=player.config.model.frame_stack,
-                     rng=np.random.default_rng(0))
+        return probe(player.model, env, player.frames_of(env), frame_stack=player.agent.frame_stack,
+                     rng=np.random.default_rng(0), count=count, seed=seed)
     finally:
         env.close()
 
@@ -144,5 +143,5 @@ def latent_map_of(player: Player) -> LatentMap | None:
 def film(player: Player, seeds: Sequence[int], path: Path) -> None:
     """Run the episodes of `seeds` again, all at once, and film them."""
     with VideoRecorder(path, len(seeds), latent_map_of(player)) as recorder:
-        for _ in player.rollout(len(seeds), recorder).run(seeds):
+        for _ in player.episodes(seeds, len(seeds), recorder):
             pass

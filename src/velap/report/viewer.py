@@ -21,8 +21,8 @@ from velap.evaluation.rollout import Episode, Moment
 from velap.methods.velap import VelapAgent
 from velap.models.checkpoint import load_checkpoint, released_checkpoint
 from velap.report.diagnose.model import open_recorded, real_states_of
-from velap.report.figures import Planned, RealStates, can_probe, planned, probe
-from velap.report.video import picture
+from velap.report.figures import PROBES, Planned, RealStates, planned
+from velap.report.video import latent_map_of, picture
 from velap.search.types import Plan
 from velap.tasks import TASKS
 
@@ -30,8 +30,6 @@ FIRST_SEED = 1000
 """Default episode: the first validation seed."""
 SIDE = 256
 """Side of the pictures of the world [px]."""
-STATES = 1200
-"""Real states in the map at most. ours: enough to see a maze's corridors, and some seconds of Isomap."""
 
 GOAL, PLAN, LEADER, NOWHERE = "goal", "plan", "leader", "nowhere"
 """Who acts in a step: π^g near the goal, π^l along a plan, a leader, or π^g with a plan of the root alone."""
@@ -123,31 +121,25 @@ def _made(agent: VelapAgent, row: int, step: int) -> MadePlan:
 def trace(player: Player, seed: int) -> Trace:
     """Run the episode of `seed`."""
     tracer = Tracer()
-    for _ in player.rollout(1, tracer).run([seed]):
+    for _ in player.episodes([seed], 1, tracer):
         pass
     return tracer.traces[0]
 
 
-def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: int = STATES) -> RealStates | None:
+def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: int = PROBES) -> RealStates | None:
     """Real states of the given dataset; else of the episode's own scene if the robot can be placed anywhere; else of the
     task's dataset if it exists; else the checkpoint's bank of latents, without frames."""
     if player.model is None:
         return None
-    rng = np.random.default_rng(0)
     if dataset is None:
-        env = player.make_env()
-        try:
-            if can_probe(env):
-                return probe(player.model, env, player.frames_of(env), frame_stack=player.config.model.frame_stack, rng=rng,
-                             count=count, seed=seed)
-        finally:
-            env.close()
+        if (found := latent_map_of(player, seed, count)) is not None:
+            return found
         own = TASKS[player.key.task].dataset_id if player.key.task in TASKS else None
         dataset = own if own is not None and minari_io.exists(own) else None
     if dataset is not None:
         metadata = {"seed": str(player.key.train_seed), "reading": player.reading.to_json()}
         recorded = open_recorded(dataset, player.key.image_key, player.model, player.config, metadata)
-        return real_states_of(player.model, recorded, rng, count)
+        return real_states_of(player.model, recorded, np.random.default_rng(0), count)
     bank = getattr(player.model, "bank_latents", torch.empty(0))
     if len(bank) == 0:
         return None

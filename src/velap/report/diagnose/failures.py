@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap.envs.protocol import Measured, Positioned, WithObjects, WithSubtasks
-from velap.evaluation.evaluate import BATCH, Player
+from velap.evaluation.evaluate import Player
 from velap.evaluation.rollout import Moment
 from velap.methods.velap import VelapAgent
 from velap.report.figures import FilmStrip
@@ -198,7 +198,7 @@ def failure_strip(trace: Trace, kind: str) -> FilmStrip:
 def watch(player: Player, seeds: Sequence[int], fastest: float | None) -> Failures:
     """Run the episodes and classify each; `fastest` is the longest recorded step if known [m/step]."""
     tracer = Tracer(every=5)
-    for _ in player.rollout(min(BATCH, len(seeds)), tracer).run(seeds):
+    for _ in player.episodes(seeds, observer=tracer):
         pass
     outcomes = judge(list(tracer.traces.values()), fastest)
     shown = max(outcomes, key=lambda outcome: (outcome.kind != "solved", outcome.steps))
