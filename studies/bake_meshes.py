@@ -1,9 +1,9 @@
 """Bakes what the four manipulation tasks draw: `python -m studies.bake_meshes` writes envs/sawyer/assets/drawing.npz.
 
-What a 64×64 frame of a camera that stands still cannot show is left out of Meta-World's scenes: collision geoms, fine relief
-of the arm's meshes, back faces of what never moves, and textures other than those of the static boxes (a part keeps the mean
-colour of its texture). Run it again after a change of Meta-World, of the view or of a task's scene; a test compares the file
-with what this script makes. Lengths are in metres.
+It leaves out what a 64×64 frame of the static camera cannot show: collision geoms, fine relief of the arm's meshes, back
+faces of what never moves, and textures of all parts except the static boxes (a part keeps the mean colour of its texture).
+Run it again after a change of Meta-World, of the view or of a task's scene; a test compares the file with its output. The
+simplification stays as it is, since datasets and checkpoints depend on every pixel. Lengths are in metres.
 
 A mesh is a soup: every triangle has its three corners to itself, so that a corner's normal may differ from its neighbour's.
 
@@ -34,16 +34,15 @@ TASKS: tuple[type[SawyerTask], ...] = (tasks.WindowClose, tasks.FaucetClose, tas
 SHARP = np.cos(np.radians(40.0))
 """Cosine of the angle between triangles from which on the edge between them is drawn sharp. ours."""
 CELL = 0.015
-"""Side of the cubes within which vertices of a mesh are drawn together [m]. ours: one pixel at the middle of the view."""
+"""Side of the cubes within which vertices of a mesh are merged [m]. ours: one pixel in the middle of the view."""
 SMALL_MESH = 1000
-"""Meshes with at most this number of triangles stay as they are. ours: those of all objects; the arm's have 2,400 and
-more."""
+"""Meshes with more triangles are simplified. ours: objects have fewer; meshes of the arm have 2,400 and more."""
 TEXTURE_SIZE = 128
 """Side of a texture, at most [texels]. ours: the table is 70 px wide in the frame."""
 STATIC_BODIES = ("tablelink", "RetainingWall", "base")
-"""Bodies below the world that stand where they are in every episode: of these only what faces the camera is kept."""
+"""Bodies below the world that never move: only their sides that face the camera are kept."""
 SITES = ("rightEndEffector", "leftEndEffector")
-"""Sites that are drawn, red balls on the finger tips. The others mark goals, which a camera does not see."""
+"""Sites that are drawn: red balls on the finger tips. The other sites mark goals, which a camera does not see."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ def smoothed(corners: Array, vertices: NDArray[np.int64]) -> Mesh:
 
 
 def simplified(mesh: Mesh, cell: float) -> Mesh:
-    """The mesh with all vertices of each cube of side `cell` [m] drawn together, at the point of least quadric error.
+    """The mesh with all vertices of each cube of side `cell` [m] merged into the point of least quadric error.
 
     Vertex clustering (Rossignac & Borrel 1993) with the representatives of Lindstrom 2000: the point of the cell that is
     nearest to the planes of all triangles that touch it. Triangles that collapse go, and so do copies of others.
@@ -197,7 +196,7 @@ def facing(view: View, mesh: Mesh) -> Mesh:
 
 
 def collect_parts(model: Any, view: View) -> list[Part]:
-    """All that may show, one part for each body that carries some and each look, and for each large mesh."""
+    """All visible surfaces: one part for each body and look, and one for each large mesh."""
     data = _at_rest(model)
     found: dict[tuple[int, Look, int], list[Mesh]] = defaultdict(list)
     for number, (body, look, surface, position, rotation) in enumerate(_surfaces(model, data)):
@@ -221,7 +220,7 @@ def collect_parts(model: Any, view: View) -> list[Part]:
 
 
 def collect_blocks(model: Any, view: View) -> list[Block]:
-    """The textured boxes of the static world that may show."""
+    """The visible textured boxes of the static world."""
     data, blocks = _at_rest(model), []
     for geom in filter(lambda geom: _shows(model, geom) and _is_block(model, geom), range(model.ngeom)):
         material, half_size = int(model.geom_matid[geom]), model.geom_size[geom]
@@ -274,7 +273,7 @@ def _shows(model: Any, geom: int) -> bool:
 
 
 def _is_block(model: Any, geom: int) -> bool:
-    """Does the geom keep its texture? The boxes of the static world do: the wood of the table shows at 64×64."""
+    """Does the geom keep its texture? The boxes of the static world do: the table's wood is visible at 64×64."""
     boxed = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX.value
     return bool(boxed and _anchor(model, model.geom_bodyid[geom]) == 0 and _texture_of(model, model.geom_matid[geom]) >= 0)
 
@@ -305,7 +304,7 @@ def _stored_mesh(model: Any, mesh: int) -> Mesh:
 
 
 def _look(model: Any, material: int, rgba: Array) -> Look:
-    """What MuJoCo would draw a geom or site of this material with."""
+    """The look of a geom or site of this material in MuJoCo."""
     plain = tuple(float(value) for value in rgba)
     if material < 0:
         return Look(plain, specular=0.5, shininess=0.5, emission=0.0)

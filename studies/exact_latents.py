@@ -1,8 +1,7 @@
-"""`velap study exact-latents`: what dynamics, values, search and controller can do where the latent is the true state.
+"""`velap study exact-latents`: success of dynamics, values, search and controller when the latent is the true state.
 
-A ruler, not a method: it reads positions that agents have to see, and tells how much of what fails is the encoder's. No
-frame is drawn, so that a training takes minutes and fifty episodes half of one. Letters: F frames, S entries of a state, N
-stacked frames, D latent dimensions.
+An upper bound, not a method: it reads positions that agents have to see, and shows which failures are the encoder's. It
+renders no frame, so that a training takes minutes. Letters: S entries of a state, N stacked frames, D latent dimensions.
 """
 
 from __future__ import annotations
@@ -42,13 +41,13 @@ EPISODES, QUICK_EPISODES, FIRST_SEED = 50, 10, 1000
 """Validation episodes."""
 BATCH = 25
 METHODS = ("td3bc", "velap")
-"""π^g alone, and the planner: both act by what was learnt on the true states."""
+"""π^g alone, and the planner."""
 HAND, STEP = 0.08, 0.008
-"""What counts as one in a latent: so much of the hand's place, and so much of its way in a step [m]."""
+"""Units of the latent: position of the hand and its displacement in a step [m]."""
 JOINT_SHARE, LEAST = 0.2, 1e-3
-"""Joints count in this share of their range in the data, places in their deviation; neither in less than `LEAST`."""
+"""Units of joints, as a share of their range in the data, and the smallest unit; the unit of places is their deviation."""
 SIDE = 64
-"""Of the pictures that carry a state in their bytes [px]."""
+"""Side of the pictures that carry a state in their bytes [px]."""
 
 
 def pack(state: NDArray[np.float32], joints: int, shape: tuple[int, ...] = (SIDE, SIDE, 3)) -> NDArray[np.uint8]:
@@ -67,7 +66,7 @@ def unpack(pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], int]:
 
 
 def without_drawing(task: Task, picture: Callable[[Any], NDArray[Any]]) -> gym.Env[Any, Any]:
-    """The task's environment with `picture(world)` in place of the frame that it would draw."""
+    """The task's environment with `picture(world)` in place of its frame."""
     kind: Any = type(make_env(task.env_id).unwrapped)
 
     class Undrawn(kind):
@@ -79,10 +78,10 @@ def without_drawing(task: Task, picture: Callable[[Any], NDArray[Any]]) -> gym.E
 
 
 def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: ProgressBar | None = None) -> FrameStore:
-    """The trajectories that `velap collect` records, step for step, with packed states in place of frames; `contexts` of
-    them all where given."""
+    """The trajectories that `velap collect` records, with packed states in place of frames; of the first `contexts` if
+    given."""
     if not isinstance(make_env(task.env_id).unwrapped, WithTrueState):
-        raise ConfigError(f"{task.name} tells no true state; expected one of the manipulation tasks.")
+        raise ConfigError(f"{task.name} has no true state; expected one of the manipulation tasks.")
     env: Any = without_drawing(task, lambda world: world.true_state())
     runs = []
     count = contexts or task.recipe.contexts
@@ -105,7 +104,7 @@ def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view:
 
 @register_encoder("exact-states")
 class ExactEncoder(Encoder):
-    """Hand, joints and places in sizes that count alike, and the hand's last two steps; zeros behind."""
+    """Hand, joints and places in comparable units, and the hand's last two steps; zeros behind."""
 
     def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
         super().__init__()
@@ -114,7 +113,7 @@ class ExactEncoder(Encoder):
         self.scale: NDArray[np.float32] = np.ones(1, np.float32)
 
     def fit(self, frames: Tensor, last: Tensor, seed: int) -> Tensor:
-        """What is one in each entry [S], by the states of the data."""
+        """Find the unit of each entry [S] from the states of the data."""
         states, joints = unpack(frames.numpy())
         entries = states.shape[1]
         if entries + 6 > self.latent_dim:
@@ -143,15 +142,15 @@ class ExactEncoder(Encoder):
 
 
 def on_states(config: Config) -> Config:
-    """The config with the true state in place of φ: phases on frozen latents alone. The state holds the speed of the
-    hand."""
+    """The config with the true state in place of φ and phases on frozen latents alone. The state contains the hand's
+    speed."""
     train = dataclasses.replace(config.train, phases=tuple(phase for phase in config.train.phases if phase.frozen))
     model = dataclasses.replace(config.model, encoder="exact-states", command_dims=0)
     return dataclasses.replace(config, model=model, train=train)
 
 
 def learn(data: FrameStore, config: Config, seed: int, view: ProgressBar | None = None) -> LatentModel:
-    """A model in eval mode, taught by all phases of `on_states`."""
+    """A model in eval mode, trained by all phases of `on_states`."""
     trainer = Trainer(config, data, Path("runs") / "exact", seed, torch.device("cpu"))
     while trainer.step < trainer.total:
         trainer.update()
@@ -185,7 +184,7 @@ def study_exact_latents(
     console: Console, name: str, changes: Mapping[str, dict[str, Any]] | None = None, seed: int = 0, quick: bool = False,
     path: Path | None = None, contexts: int | None = None,
 ) -> list[dict[str, Any]]:
-    """Collect, learn, play and print; the figures go to `path` as JSON where given. One row a method."""
+    """Collect, learn, play and print; writes the figures to `path` as JSON if given. One row a method."""
     task = get_task(name)
     config = on_states(override(make_config(name), **(changes or {})))
     began = time.monotonic()
@@ -203,7 +202,7 @@ def study_exact_latents(
                      "mean_steps": float(np.mean([episode.steps for episode in episodes])), "config_hash": config.hash()})
         console.print(f"{method}: {rows[-1]['solved']} of {len(episodes)} solved, {rows[-1]['mean_steps']:.0f} steps",
                       markup=False)
-    console.print(f"{time.monotonic() - began:.0f} s. The latent was the true state: a ruler, not a result.", markup=False)
+    console.print(f"{time.monotonic() - began:.0f} s; the latent was the true state: an upper bound", markup=False)
     if path is not None:
         write_atomic(path, (json.dumps(rows, indent=1) + "\n").encode())
         console.print(f"written to {path}", markup=False)

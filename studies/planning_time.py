@@ -25,7 +25,7 @@ RECORDS = Path("results/planning_time")
 FIRST_SEED = 1000
 """Seed of the first episode. ours: validation seeds; their test starts are none of Table 1's."""
 ROUND = 5
-"""Episodes that every point gets before one gets more: an interruption leaves points of equal weight."""
+"""Episodes that every point runs before any runs more: an interruption leaves points of equal weight."""
 FIGURES = {"7": "SpiralMaze", "8": "ObstacleMaze"}
 N_REPLAN = {"SpiralMaze": 25, "ObstacleMaze": 15}
 """Environment steps between VELAP's plans, App. E.4; MPPI replans every 5 steps."""
@@ -69,19 +69,19 @@ class Point:
                 "controller": {"n_replan": N_REPLAN[self.task], "lookahead": 0}}
 
     def run(self, checkpoint: Path, records: Path, seeds: range, fresh: bool) -> None:
-        """Run the episodes that are not recorded yet, one at a time, so that a plan has the machine to itself."""
+        """Run the missing episodes one at a time, so that a plan has the machine to itself."""
         what = Evaluation(self.task, method=self.method, checkpoint=checkpoint, changes=self.changes())
         evaluate(what, seeds, records / self.name, batch=1, fresh=fresh)
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A point and what its records say."""
+    """A point and the statistics of its records."""
 
     point: Point
     summary: Summary
     fastest: float
-    """Fastest of all plans [ms]: on a busy machine, nearer to what a plan costs than the median."""
+    """Fastest of all plans [ms]: on a busy machine, closer to the cost of a plan than the median."""
 
     @property
     def ms(self) -> float:
@@ -95,7 +95,7 @@ class Measured:
 
 
 def points_of(task: str) -> list[Point]:
-    """All points of a task, the methods in turn."""
+    """All points of a task, alternating between the methods."""
     velap = [Point(task, "velap", settings) for settings in VELAP_POINTS[task]]
     mppi = [Point(task, "mppi", settings) for settings in MPPI_POINTS]
     return [point for pair in zip(velap, mppi, strict=False) for point in pair] + velap[len(mppi):]
@@ -113,7 +113,7 @@ def measured(task: str, records: Path, preset: str = "default", seed: int = 0) -
 
 
 def pareto_front(points: Sequence[Measured]) -> list[Measured]:
-    """The points that no faster one equals in success, the fastest first."""
+    """The points with more success than every faster one, the fastest first."""
     front: list[Measured] = []
     for each in sorted(points, key=lambda each: (each.ms, -each.rate)):
         if not front or each.rate > front[-1].rate:
@@ -127,7 +127,7 @@ def of(method: str, points: Sequence[Measured]) -> list[Measured]:
 
 
 def ratio_text(points: Sequence[Measured]) -> str:
-    """How much faster VELAP is where it solves at least as much as MPPI at its best."""
+    """How much faster VELAP is at MPPI's best success."""
     velap, mppi = pareto_front(of("velap", points)), pareto_front(of("mppi", points))
     if not velap or not mppi:
         return "Only one method is measured: no ratio."
@@ -195,7 +195,7 @@ def draw(task: str, points: Sequence[Measured], *paths: Path) -> None:
 
 def show_planning_time(console: Console, number: str, path: Path, *, checkpoint: Path | None = None, episodes: int = 50,
                        no_run: bool = False, fresh: bool = False, records: Path = RECORDS) -> None:
-    """Run what is missing, print the table, and draw the picture; where a page lies beside it, the table goes there too."""
+    """Run what is missing, print the table, and draw the picture; a page beside the picture gets the table too."""
     if episodes < 1:
         raise ConfigError(f"got {episodes} episodes a point; expected at least 1.")
     task = FIGURES[number]

@@ -120,7 +120,7 @@ def test_openpi_client_drives_a_task_to_the_goal_as_the_agent_itself_would() -> 
     released = ROOT / "checkpoints" / "SpiralMaze.safetensors"
     with served(load_policy(released, device="cpu"), api_key="secret") as port:
         driven = example.drive("SpiralMaze", 1000, "127.0.0.1", port, "secret")
-    alone = next(load_player(Evaluation("SpiralMaze", checkpoint=released, device="cpu")).rollout(1).run([1000]))
+    alone = next(load_player(Evaluation("SpiralMaze", checkpoint=released, device="cpu")).episodes([1000]))
     assert driven == (alone.success, alone.steps)
     assert alone.success
 

@@ -66,7 +66,7 @@ def subject(player: Player) -> Subject:
 
 
 def test_a_trace_is_the_episode_that_a_rollout_gives(player: Player, seen: Trace) -> None:
-    (episode,) = player.rollout(1).run([SEED])
+    (episode,) = player.episodes([SEED])
     assert (seen.outcome.success, seen.outcome.steps) == (episode.success, episode.steps) and episode.success
     assert len(seen.steps) == episode.steps
     assert len(seen.plans) == len(episode.plan_ms)

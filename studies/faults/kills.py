@@ -31,23 +31,23 @@ SMALL: dict[str, dict[str, Any]] = {
     "train": {"joint": {"steps": 12, "windows": 4}, "latent": {"steps": 12}, "log_every": 2, "checkpoint_every": 2},
     "planner": {"n_iter": 10, "candidates": 5}, "model": {"bank_size": 32},
 }
-"""Config fields of the shrunk task. ours: a run of seconds that checkpoints every other step, in both phases."""
+"""Config fields of the shrunk task: a run of seconds with a checkpoint every other step, in both phases."""
 TRAJECTORIES = 120
-"""Trajectories of the shrunk recipe: some reach the goal."""
+"""Trajectories of the shrunk recipe; some reach the goal."""
 FILE_LIMIT, KILL_AT = "VELAP_FILE_LIMIT", "VELAP_KILL_AT_FSYNC"
 """Environment variables of `shrunk_main`: largest file [bytes], number of the fsync to die at."""
 CODE = "import sys; from studies.faults.kills import shrunk_main; from velap.cli import main; sys.exit(shrunk_main(main))"
 
 
 def shrink() -> None:
-    """Replace SpiralMaze in this process by a version with little data and little training."""
+    """Replace SpiralMaze in this process by a version with few trajectories and updates."""
     task = TASKS[TASK]
     recipe = dataclasses.replace(task.recipe, trajectories=TRAJECTORIES)
     TASKS[TASK] = dataclasses.replace(task, recipe=recipe, overrides=SMALL)
 
 
 def shrunk_main(main: Callable[[], int]) -> int:
-    """`main`, the command line, with the shrunk task and with faults that the environment asks for."""
+    """`main`, the command line, with the shrunk task and the faults of the environment variables."""
     if FILE_LIMIT in os.environ:
         import resource
 
@@ -60,7 +60,7 @@ def shrunk_main(main: Callable[[], int]) -> int:
 
 
 def _kill_at_fsync(number: int) -> None:
-    """This process kills itself at its `number`-th fsync: a file is written and not yet renamed into place."""
+    """Make this process kill itself at its `number`-th fsync, before the written file is renamed into place."""
     fsync, calls = os.fsync, count(1)
 
     def dying(descriptor: Any) -> None:
@@ -80,7 +80,7 @@ def start(arguments: Sequence[str], folder: Path, datasets: Path, **extra: str) 
 
 
 def unreadable(folder: Path) -> list[str]:
-    """What is wrong with the files below `folder`; names that begin with a dot are unfinished work and may be anything."""
+    """Unreadable files below `folder`, except unfinished ones, whose names begin with a dot."""
     problems = []
     for path in sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")):
         try:
@@ -96,7 +96,7 @@ def leftovers(folder: Path) -> list[str]:
 
 
 def _read(path: Path) -> None:
-    """Read a file to its end, and check what checksum it has."""
+    """Read a file to its end, and compare its checksum if it has one."""
     from velap.data.minari_io import file_sha256
     from velap.runs import load_tensors
 
@@ -118,7 +118,7 @@ def _read(path: Path) -> None:
 
 
 def fingerprint(folder: Path) -> str:
-    """SHA-256 of what a run left: weights, logged losses, dataset arrays; not times, not the command."""
+    """SHA-256 of the weights, logged losses and dataset arrays of a run, without times."""
     from velap.runs import load_tensors
 
     digest = hashlib.sha256()
@@ -137,13 +137,13 @@ def fingerprint(folder: Path) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class KillReport:
-    """Answer of the kills of one command."""
+    """Result of killing one command."""
 
     command: str
     kills: int
     problems: tuple[str, ...]
     fingerprint: str
-    """Of the uninterrupted run, and of every resumed one if there is no problem."""
+    """Of the uninterrupted run; without a problem, also of every resumed one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,27 +152,27 @@ class Victim:
 
     arguments: tuple[str, ...]
     resume: tuple[str, ...]
-    """Arguments that go on with a killed run."""
+    """Arguments that resume a killed run."""
     datasets: Path | None
-    """Minari's root; None puts it into each run's own folder."""
+    """Minari's root; None: in each run's own folder."""
     fsyncs: int
-    """An undisturbed run calls fsync at least so often."""
+    """Fewest calls of fsync in an uninterrupted run."""
 
     def start(self, place: Path, **extra: str) -> subprocess.Popen[str]:
-        """Start it in `place`."""
+        """Start the command in `place`."""
         return start(self.arguments, place, self.datasets or place / "datasets", **extra)
 
     def go_on(self, place: Path) -> subprocess.Popen[str]:
-        """Start it again in `place`, where it was killed."""
+        """Resume the command in `place`."""
         return start(self.resume, place, self.datasets or place / "datasets")
 
 
 def kill_and_resume(victim: Victim, folder: Path, kills: int, rng: np.random.Generator,
                     on_kill: Callable[[int], None] = lambda done: None) -> KillReport:
-    """Run the command once to the end, then again and again until it was killed `kills` times, and resume it each time.
+    """Run the command once to the end, then kill and resume it `kills` times.
 
-    Every other kill falls on a random fsync, the rest on moments uniform over the time from the first file of a run to its
-    end; a run that ends before its moment is repeated with another one. Each works in a folder of its own below `folder`.
+    Every other kill falls on a random fsync, the others on moments uniform between the first file of a run and its end; a
+    run that ends earlier is repeated with another moment. Each run has a folder of its own below `folder`.
     """
     whole = folder / "whole"
     seconds = _time_whole(victim, whole)
@@ -230,6 +230,6 @@ def _time_whole(victim: Victim, place: Path) -> float:
 
 
 def _wait_for_file(process: subprocess.Popen[str], place: Path) -> None:
-    """Until the process has written something, or has ended."""
+    """Wait until the process has written a file or has ended."""
     while process.poll() is None and not any(path.is_file() for path in place.rglob("*")):
         time.sleep(0.005)

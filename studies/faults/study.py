@@ -1,4 +1,4 @@
-"""`velap study faults`: kills, spoilt files, wrong commands and full disks in one go, and the report of them."""
+"""`velap study faults`: kills, damaged files, wrong commands and full disks, and a report."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from velap.runs import write_atomic
 
 KILLS, QUICK_KILLS = 20, 2
 DISK = 32 * 2**20
-"""Size of the file system that is filled up [bytes]."""
+"""Size of the file system that is filled [bytes]."""
 MESSAGE = 420
-"""Longest message shown in the report [characters]."""
+"""Longest message in the report [characters]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,13 +45,13 @@ class DiskCase:
     fault: str
     arguments: tuple[str, ...]
     again: tuple[str, ...]
-    """Arguments that go on once there is room."""
+    """Arguments that finish the work once there is room."""
     datasets: str
     """Minari's root in the case's folder."""
     free: int
-    """Room on the disk, or where none can be mounted the largest file [bytes]."""
+    """Room on the disk, or, if no disk can be mounted, the largest file [bytes]."""
     result: str
-    """Folder of the base whose bits the finished command has to reproduce; empty where there are none to compare."""
+    """Folder of the base that the finished command has to reproduce bit by bit; empty for no comparison."""
 
 
 RECORD = ("evaluate", "SpiralMaze", "--episodes", "1", "--max-steps", "3", "--checkpoint", "run/model.safetensors",
@@ -77,9 +77,9 @@ DISK_CASES = (
 
 @contextmanager
 def full_disk(folder: Path, free: int, mount: bool = True) -> Iterator[int | None]:
-    """Make `folder` a file system with `free` bytes of room; where it cannot be mounted, a limit on files stands in.
+    """Make `folder` a file system with `free` bytes of room; yields None, or `free` as a limit on files if it cannot mount.
 
-    Yields that limit [bytes]. What was written stays in `folder` when the block is left, with room again.
+    Afterwards `folder` keeps what was written, and has room again.
     """
     folder.mkdir(parents=True)
     command = ["mount", "-t", "tmpfs", "-o", f"size={DISK}", "tmpfs", str(folder)]
@@ -99,7 +99,7 @@ def full_disk(folder: Path, free: int, mount: bool = True) -> Iterator[int | Non
 
 
 def check_disk(case: DiskCase, base: Path, place: Path, run: RunCommand, mount: bool = True) -> CaseResult:
-    """Run a command onto a full disk, judge what it says and leaves, and let it go on with room."""
+    """Run a command on a full disk, check its message and files, and let it finish with room."""
     shutil.copytree(base, place)
     disk = place / "disk"
     with full_disk(disk, case.free, mount) as limit:
@@ -126,7 +126,7 @@ def run_alone(arguments: Sequence[str], place: Path, datasets: str = "datasets",
 
 
 def study_faults(console: Console, quick: bool = False, seed: int = 0, write: Path | None = None) -> None:
-    """Run everything, print what went wrong, and write the report; raises VelapError when something did."""
+    """Run all faults, print the problems, and write the report; raises VelapError if there are problems."""
     kills = QUICK_KILLS if quick else KILLS
     total = 2 * kills + len(CASES) + len(DISK_CASES)
     with TemporaryDirectory() as folder, ProgressBar(console, "faults", total) as view:
@@ -146,7 +146,7 @@ def study_faults(console: Console, quick: bool = False, seed: int = 0, write: Pa
 
 
 def _kill(root: Path, kills: int, rng: np.random.Generator, view: ProgressBar) -> list[KillReport]:
-    """Kill collecting and training; leaves an intact dataset and run in `root/base`."""
+    """Kill collection and training; leaves an intact dataset and run in `root/base`."""
     collect, train = ("collect", "SpiralMaze", "--workers"), ("train", "SpiralMaze", "--out", "run")
     victim = Victim(arguments=(*collect, "2"), resume=(*collect, "1"), datasets=None, fsyncs=8)
     reports = [kill_and_resume(victim, root / "collect", kills, rng,
@@ -160,7 +160,7 @@ def _kill(root: Path, kills: int, rng: np.random.Generator, view: ProgressBar) -
 
 
 def _spoil(root: Path, done: int, view: ProgressBar) -> list[CaseResult]:
-    """All other cases on copies of `root/base`; `done` of the view's total went before."""
+    """All other cases, on copies of `root/base`; `done` of the view's total came before."""
     results = []
     for case in CASES:
         results.append(check(case, root / "base", root / "case", run_alone))

@@ -1,7 +1,4 @@
-"""The benchmarks of `velap bench`, one function each: both sides measured in one run, in turns, so that a slow moment of the
-machine hits both.
-
-Letters: B environments, D latent.
+"""The benchmarks of `velap bench`, one function each: both sides run in turns, so that slow moments hit both.
 """
 
 from __future__ import annotations
@@ -22,18 +19,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from torch import Tensor
 
 from velap.cli.memory import keep_freed_memory
-from velap.config import JointPhase, ModelConfig, override
-from velap.config.planning import PlannerConfig
+from velap.config import JointPhase, override
 from velap.data.frames import FrameStore
 from velap.data.loading import load_store
 from velap.data.writing import write_dataset
-from velap.errors import CheckpointError, VelapError
+from velap.errors import VelapError
 from velap.methods.mppi import MPPIConfig, shoot
 from velap.models.checkpoint import load_checkpoint, released_checkpoint
-from velap.models.velap import LatentModel, Spaces
 from velap.runs import make_generator
 from velap.search.est import plan
 from velap.tasks import get_task, make_config
@@ -45,9 +39,9 @@ TASK = "SpiralMaze"
 DATASET = "bench/synthetic-v0"
 GIB = 2**30
 PLANS_A_TURN = 8
-"""Plans for one environment between two of MPPI, whose threads go on spinning for some milliseconds after it."""
+"""Plans for one environment in a turn: MPPI's threads keep spinning for some milliseconds after its turn."""
 MPPI_BATCH = 8
-"""Environments that MPPI plans for at once; its 1000 samples a row make larger batches no faster a row."""
+"""Environments that MPPI plans for at once; larger batches are no faster a row."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +52,7 @@ class Measurement:
     unit: str
     reference_name: str
     reference_value: float | None
-    """In the same unit; None where the reference cannot run here."""
+    """In the same unit; None if the reference cannot run here."""
 
     @property
     def ratio(self) -> float | None:
@@ -97,16 +91,6 @@ def synthetic_store(trajectories: int | None = None) -> FrameStore:
                                   action_low=np.full(2, -1.0), action_high=np.full(2, 1.0), dataset_id=DATASET)
 
 
-def train_frames_per_s(device: torch.device) -> Measurement:
-    """Joint updates as SpiralMaze trains, one frame a state."""
-    return _train_frames_per_s(device, make_config(TASK).model.frame_stack)
-
-
-def train_frames_per_s_stack3(device: torch.device) -> Measurement:
-    """Joint updates with the default of three frames a state, nine channels."""
-    return _train_frames_per_s(device, ModelConfig().frame_stack)
-
-
 def train_minutes(device: torch.device) -> Measurement:
     """A whole training of WindowClose, the sum over its phases of updates over measured rate; on CUDA against the same
     updates without graphs, on a CPU against nothing."""
@@ -142,17 +126,22 @@ def training_minutes(trainer: Trainer, warm: int = 16, count: int = 200, most: f
 
 
 def _now(device: torch.device) -> float:
-    """Seconds of a clock, once the device has done what it was given."""
+    """Time after all work of the device has finished [s]."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
-def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
-    """Joint updates against the forward and backward pass of the encoder alone on frames that lie ready."""
+def train_frames_per_s(device: torch.device, frame_stack: int | None = None) -> Measurement:
+    """SpiralMaze's joint updates against the encoder's forward and backward pass alone, on prepared frames.
+
+    `frame_stack` is that of the task unless given [frames].
+    """
     keep_freed_memory()
     with TemporaryDirectory() as folder:
-        settings = override(make_config(TASK), model={"frame_stack": frame_stack})
+        settings = make_config(TASK)
+        frame_stack = frame_stack or settings.model.frame_stack
+        settings = override(settings, model={"frame_stack": frame_stack})
         trainer = Trainer(settings, synthetic_store(), Path(folder), 0, device)
         phase, encoder = trainer.phases[0], trainer.model.encoder
         assert isinstance(phase, JointPhase), f"{TASK} begins with its joint phase"
@@ -176,41 +165,14 @@ def _train_frames_per_s(device: torch.device, frame_stack: int) -> Measurement:
                        f"stacks of {frame_stack}, bfloat16", frames / encoded)
 
 
-def _planning_model(device: torch.device) -> tuple[LatentModel, PlannerConfig, str]:
-    """The released checkpoint, or random weights with thresholds that let every tree fill; and which it is."""
-    planner = make_config(TASK, "paper").planner
-    try:
-        model, _, _ = load_checkpoint(released_checkpoint(TASK), device)
-        return model, planner, "released checkpoint"
-    except CheckpointError:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            model = LatentModel(make_config(TASK).model, Spaces(64, 64, (-1.0, -1.0), (1.0, 1.0)), 0.96).eval()
-    model.to(device).requires_grad_(False)
-    latents = _roots(model, 256)
-    actions = torch.rand(256, 2, generator=make_generator(1)).to(device) * 2 - 1
-    model.step_distance.copy_((model.step(latents, actions) - latents).norm(dim=-1).quantile(0.95))
-    changes = {"discard_low_exponent": 1e4, "discard_high_exponent": 1e-6}
-    return model, override(make_config(TASK, "paper"), planner=changes).planner, "random weights, full trees"
-
-
-@torch.inference_mode()
-def _roots(model: LatentModel, batch: int) -> Tensor:
-    """[B, D] latents to plan from: of the dataset where the model keeps some, else of frames of noise."""
-    generator = make_generator(0)
-    if model.bank_latents.any():
-        return model.bank_latents[torch.randint(len(model.bank_latents), (batch,), generator=generator)].float()
-    frames = torch.randint(256, (batch, model.config.frame_stack, 64, 64, 3), generator=generator, dtype=torch.uint8)
-    return model.encode(frames.to(model.bank_latents.device))
-
-
-def _plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int = 5) -> Measurement:
-    """Latency per environment of a VELAP plan for `batch` environments at once against MPPI with the same model."""
-    model, planner, kind = _planning_model(device)
-    planner = replace(planner, n_sim=n_sim)
-    fns = model.search_fns()
+def plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int = 5) -> Measurement:
+    """Time of a VELAP plan for `batch` environments at once, each, against MPPI's, both by the released checkpoint."""
+    model = load_checkpoint(released_checkpoint(TASK), device)[0]
+    planner = replace(make_config(TASK, "paper").planner, n_sim=n_sim)
+    fns, bank = model.search_fns(), model.bank_latents
+    roots = bank[torch.randint(len(bank), (batch,), generator=make_generator(0))].float()
     shots, together, seeds = MPPIConfig(), min(batch, MPPI_BATCH), count()
-    roots, plans = _roots(model, batch), PLANS_A_TURN if batch == 1 else 1
+    plans = PLANS_A_TURN if batch == 1 else 1
 
     def velap_plans() -> None:
         for _ in range(plans):
@@ -222,46 +184,29 @@ def _plan_latency(device: torch.device, batch: int, repeats: int, n_sim: int = 5
     velap_s, mppi_s = in_turns([velap_plans, mppi_plans], repeats, device)
     chunk = f", {together} of the {batch} environments at once" if together < batch else ""
     name = (f"MPPI {shots.samples} × {shots.horizon} × {shots.iterations}{chunk}; VELAP {planner.n_iter} expansions of "
-            f"{planner.n_sim} steps; {kind}")
+            f"{planner.n_sim} steps; released checkpoint")
     return Measurement(1e3 * velap_s / (plans * batch), "ms/environment", name, 1e3 * mppi_s / together)
 
 
-def plan_latency_1(device: torch.device) -> Measurement:
-    """One environment, Table 8's setting for most tasks."""
-    return _plan_latency(device, 1, 9)
-
-
-def plan_latency_1_sim10(device: torch.device) -> Measurement:
-    """One environment, expansions of 10 steps, Table 8's setting for SpiralMaze, ButtonWall and DrawerButton."""
-    return _plan_latency(device, 1, 9, n_sim=10)
-
-
-def plan_latency_64(device: torch.device) -> Measurement:
-    """64 environments at once."""
-    return _plan_latency(device, 64, 3)
-
-
 META_WORLD = """
-import sys, time, gymnasium
+import sys, gymnasium
 env = gymnasium.make("metaworld:Meta-World/MT1", env_name="window-close-v3", render_mode="rgb_array", width=64, height=64,
                      camera_name="corner", disable_env_checker=True)
 env.reset(seed=0)
 env.action_space.seed(0)
 print(env.render().std(), flush=True)
 for line in sys.stdin:
-    began = time.perf_counter()
     for _ in range(int(line)):
         env.step(env.action_space.sample())
         env.render()
-    print(time.perf_counter() - began, flush=True)
+    print("done", flush=True)
 """
 """Meta-World as delivered, in a process of its own: two OpenGL contexts in one process disturb each other."""
 
 
 @contextmanager
-def meta_world(backend: str) -> Iterator[Callable[[int], float] | None]:
-    """A function that runs so many steps of WindowClose with 64 × 64 pixels and returns their time [s]; None without
-    Meta-World."""
+def meta_world(backend: str) -> Iterator[Callable[[int], object] | None]:
+    """A function that runs a number of steps of WindowClose with 64 × 64 pixels; None without Meta-World."""
     environment = {key: value for key, value in os.environ.items() if key != "LP_NUM_THREADS"}
     with subprocess.Popen([sys.executable, "-c", META_WORLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                           stderr=subprocess.DEVNULL, text=True, env={**environment, "MUJOCO_GL": backend}) as child:
@@ -269,9 +214,9 @@ def meta_world(backend: str) -> Iterator[Callable[[int], float] | None]:
         assert child.stdout is not None
         pipes = child.stdin, child.stdout
 
-        def run(steps: int) -> float:
+        def run(steps: int) -> str:
             print(steps, file=pipes[0], flush=True)
-            return float(pipes[1].readline())
+            return pipes[1].readline()
 
         try:
             draws = float(child.stdout.readline() or 0) > 0
@@ -280,40 +225,29 @@ def meta_world(backend: str) -> Iterator[Callable[[int], float] | None]:
             child.kill()
 
 
-def env_steps_per_s(device: torch.device) -> Measurement:
-    """Steps of SpiralMaze with their 64 × 64 frame; Meta-World's are another task, a manipulator of meshes."""
-    return _env_steps_per_s(TASK, "another task: ")
-
-
-def sawyer_env_steps_per_s(device: torch.device) -> Measurement:
-    """Steps of WindowClose with their 64 × 64 frame; Meta-World's are the same physics drawn by its own `render()`."""
-    return _env_steps_per_s("WindowClose", "")
-
-
-def _env_steps_per_s(name: str, note: str) -> Measurement:
-    """Environment steps of a task with their frame, random actions, against Meta-World's step and render in turns."""
+def env_steps_per_s(device: torch.device, name: str) -> Measurement:
+    """Steps of a task with their 64 × 64 frame, random actions, against those of Meta-World's WindowClose, in turns."""
     from velap.envs.gl import working_backend
 
     env: gym.Env[Any, Any] = gym.make(f"velap.envs:{get_task(name).env_id}")
     env.action_space.seed(0)
     env.reset(seed=0)
-    steps, reference_steps, repeats = min(300, get_task(name).max_steps), 12, 5
-    times: list[float] = []
-    reference_times: list[float] = []
-    with meta_world(working_backend()) as reference:
-        for _ in range(repeats + 1):
-            env.reset()
-            began = time.perf_counter()
-            for _ in range(steps):
-                env.step(env.action_space.sample())
-            times.append((time.perf_counter() - began) / steps)
-            if reference is not None:
-                reference_times.append(reference(reference_steps) / reference_steps)
+    steps, reference_steps = min(300, get_task(name).max_steps), 12
+
+    def ours() -> None:
+        env.reset()
+        for _ in range(steps):
+            env.step(env.action_space.sample())
+
+    backend, note = working_backend(), "" if name == "WindowClose" else "another task: "
+    described = f"{note}Meta-World's window-close-v3, step + render(64 × 64), {backend}"
+    with meta_world(backend) as reference:
+        if reference is None:
+            (seconds,) = in_turns([ours], 5, device)
+            return Measurement(steps / seconds, "steps/s", f"{described}; it does not run here", None)
+        seconds, theirs = in_turns([ours, lambda: reference(reference_steps)], 5, device)
     env.close()
-    described = f"{note}Meta-World's window-close-v3, step + render(64 × 64), {working_backend()}"
-    if reference is None:
-        return Measurement(1 / statistics.median(times[1:]), "steps/s", f"{described}; it does not run here", None)
-    return Measurement(1 / statistics.median(times[1:]), "steps/s", described, 1 / statistics.median(reference_times[1:]))
+    return Measurement(steps / seconds, "steps/s", described, reference_steps / theirs)
 
 
 COLLECTED_CONTEXTS = 20
@@ -340,7 +274,7 @@ def collect_frames_per_s(device: torch.device) -> Measurement:
 
 @contextmanager
 def _datasets_in(folder: str) -> Iterator[None]:
-    """Minari's datasets lie in `folder` for a while."""
+    """Put Minari's datasets into `folder`."""
     key = "MINARI_DATASETS_PATH"
     before = os.environ.get(key)
     os.environ[key] = folder
@@ -387,7 +321,7 @@ def print_peak(run_dir: str, device: str) -> None:
 
 
 def peak_memory() -> int:
-    """Largest resident memory of this process so far [bytes]. Its program alone: getrusage counts what forked it as well."""
+    """Largest resident memory of this process so far [bytes]; getrusage would include the process that forked it."""
     import resource
 
     status = Path("/proc/self/status")

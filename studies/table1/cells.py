@@ -1,4 +1,4 @@
-"""The cells of Table 1, and what is there of each: dataset, joint checkpoint, head, records. Nothing is remembered."""
+"""The cells of Table 1, and the state of each on disk: dataset, joint checkpoint, head, records."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ DATASET_SEED = 0
 RELEASED = Path("checkpoints")
 """Where released checkpoints lie, `<task>.safetensors`."""
 TRAINING = Path("results/training.json")
-"""How long each joint checkpoint and head took to train, and its hash: the files themselves are not kept."""
+"""Training time and hash of each joint checkpoint and head, whose files are not kept."""
 
 OTHER_PLANNER = "the checkpoint holds another planner or controller than today's"
 
 
 def in_paper_order(names: Sequence[str], order: Sequence[str]) -> tuple[str, ...]:
-    """`names` as the paper lists them, followed by those that it does not have."""
+    """`names` in the paper's order, followed by those that the paper lacks."""
     return tuple(sorted(names, key=lambda name: order.index(name) if name in order else len(order)))
 
 
 TASK_ORDER = in_paper_order([name for name in TASKS if name not in {task.name for task in ROBOT_TASKS}], PAPER_TASKS)
-"""Tasks of the table; those of the robot belong to Table 11."""
+"""Tasks of the table; the robot tasks belong to Table 11."""
 METHOD_ORDER = in_paper_order(tuple(METHODS), ROWS)
 
 
@@ -67,12 +67,12 @@ class Cell:
 
     @property
     def head(self) -> Path | None:
-        """The head that the method needs beside it; None for methods without one."""
+        """The method's head; None for methods without one."""
         return head_path(self.checkpoint, self.method) if get_method(self.method).learns else None
 
     @property
     def released(self) -> Path | None:
-        """The released checkpoint where it is what the joint training would give and that has not begun; None otherwise."""
+        """The released checkpoint if it is what the joint training would give and that has not begun; else None."""
         path = RELEASED / f"{self.task}.safetensors"
         metadata = None if self.checkpoint.parent.exists() else file_metadata(path)
         if metadata is None or metadata.get("seed") != str(self.seed):
@@ -81,12 +81,12 @@ class Cell:
 
     @property
     def joint(self) -> Mapping[str, str] | None:
-        """Metadata of the joint checkpoint, or of the released one that stands for it; None where there is neither."""
+        """Metadata of the joint checkpoint, or of the released one in its place; None without both."""
         return file_metadata(self.released or self.checkpoint)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names in `TRAINING` of what the method learns from."""
+        """Names in `TRAINING` of the joint checkpoint and head."""
         where = f"{self.preset} seed {self.seed}"
         joint, head = f"joint {self.task} {where}", f"head {self.task} {self.method} {where}"
         method = get_method(self.method)
@@ -130,17 +130,17 @@ def parse_only(filters: Sequence[str] = ()) -> tuple[Cell, ...]:
 
 @dataclass(frozen=True)
 class State:
-    """What is there of a cell's records."""
+    """The records of a cell."""
 
     done: int
-    """Recorded episodes of the config of today [episodes]."""
+    """Recorded episodes of today's config [episodes]."""
     records: tuple[Record, ...] = ()
     problem: str = ""
-    """Why the records are not those of the cell as it is configured today; empty where they are."""
+    """Why the records do not belong to today's config; empty if they do."""
 
 
 def look(cell: Cell, root: Path, episodes: int) -> State:
-    """The records of a cell, compared with the config of today and the checkpoint that is there."""
+    """The records of a cell, compared with today's config and the checkpoint on disk."""
     path = cell.records(root)
     try:
         records = read_records(path) if path.exists() else []
@@ -152,7 +152,7 @@ def look(cell: Cell, root: Path, episodes: int) -> State:
 
 
 def record_problem(cell: Cell, records: Sequence[Record]) -> str:
-    """Why these records are not of the cell as it is configured today; empty where they are."""
+    """Why these records do not belong to today's config; empty if they do."""
     if not records:
         return ""
     config_hash, task, method = expected_hash(cell), get_task(cell.task), get_method(cell.method)
@@ -174,7 +174,7 @@ def record_problem(cell: Cell, records: Sequence[Record]) -> str:
 
 
 def expected_hash(cell: Cell) -> str | None:
-    """The `config_hash` that an evaluation of the cell writes today; None where its head is not known."""
+    """The `config_hash` that an evaluation of the cell writes today; None if its head is unknown."""
     config, method = make_config(cell.task, cell.preset), get_method(cell.method)
     if cell.head is None:
         return method.config_hash(config)
@@ -185,19 +185,19 @@ def expected_hash(cell: Cell) -> str | None:
 
 @dataclass
 class _Head:
-    """What `Method.config_hash` asks of a head."""
+    """The part of a head that `Method.config_hash` uses."""
 
     settings: str
     weights_sha256: str
 
 
 def head_settings(cell: Cell) -> str:
-    """The settings that the cell's head is trained with today."""
+    """Today's settings of the cell's head."""
     return get_method(cell.method).learner_config(cell.preset).to_json()
 
 
 def outdated(cell: Cell) -> Iterator[tuple[Path, str]]:
-    """Files that the cell would be made of and that are not what today's code would make, each with the reason."""
+    """Inputs of the cell that differ from what today's code would make, each with the reason."""
     if not get_method(cell.method).needs_model:
         return
     if reason := dataset_problem(cell.task):
@@ -217,18 +217,18 @@ def outdated(cell: Cell) -> Iterator[tuple[Path, str]]:
 
 
 def dataset_file(task: str) -> Path:
-    """The file by which the task's dataset is known to be whole."""
+    """The file whose presence shows that the task's dataset is complete."""
     return minari_io.dataset_path(get_task(task).dataset_id) / "data" / "metadata.json"
 
 
 def dataset_provenance(task: str) -> dict[str, Any]:
-    """What velap noted in the metadata of the task's dataset; empty where there is none."""
+    """velap's entry in the metadata of the task's dataset; empty without one."""
     dataset_id = get_task(task).dataset_id
     return minari_io.velap_metadata(minari_io.read_metadata(dataset_id)) if minari_io.exists(dataset_id) else {}
 
 
 def dataset_problem(task: str) -> str:
-    """Why the task's dataset is not what `velap collect` makes today; empty where it is, or where there is none."""
+    """Why the task's dataset differs from what `velap collect` makes today; empty if it does not, or without a dataset."""
     if not minari_io.exists(get_task(task).dataset_id):
         return ""
     plan = dataset_provenance(task).get("plan")
@@ -243,7 +243,7 @@ def dataset_problem(task: str) -> str:
 
 
 def checkpoint_problem(cell: Cell, metadata: Mapping[str, str]) -> str:
-    """Why a joint checkpoint with this metadata cannot stand for today's config; empty where it can."""
+    """Why a joint checkpoint with this metadata does not belong to today's config; empty if it does."""
     config, dataset_hash = make_config(cell.task, cell.preset), dataset_provenance(cell.task).get("content_sha256")
     try:
         saved = Config.from_json(metadata.get("config", ""))
@@ -259,7 +259,7 @@ def checkpoint_problem(cell: Cell, metadata: Mapping[str, str]) -> str:
 
 
 def file_metadata(path: Path) -> Mapping[str, str] | None:
-    """Metadata of a checkpoint or head, its tensors left alone; None where there is no readable file."""
+    """Metadata of a checkpoint or head, without reading its tensors; None without a readable file."""
     if not path.is_file():
         return None
     stat = path.stat()
@@ -285,7 +285,7 @@ def training_notes() -> dict[str, dict[str, Any]]:
 
 
 def note_training(cells: Sequence[Cell]) -> None:
-    """Write the training times of the checkpoints and heads that are there into `TRAINING`."""
+    """Add the training times of the existing checkpoints and heads to `TRAINING`."""
     notes = before = training_notes()
     for cell in cells:
         if any(True for _ in outdated(cell)):
@@ -302,7 +302,7 @@ def note_training(cells: Sequence[Cell]) -> None:
 
 
 def training_seconds(cell: Cell) -> float | None:
-    """Time of the joint training and of the method's head; None where it is not known [s]."""
+    """Time of the joint training and of the method's head; None if unknown [s]."""
     notes = training_notes()
     known = [notes[name]["seconds"] for name in cell.names if name in notes]
     return sum(known) if known and len(known) == len(cell.names) else None

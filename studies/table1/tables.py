@@ -34,13 +34,13 @@ CSV_COLUMNS = [*KEY, "train_seed", *NUMBERS, *SPREAD, *COST, *ORIGIN]
 
 @dataclass(frozen=True)
 class Results:
-    """Everything that the table says."""
+    """The data of the table."""
 
     runs: pd.DataFrame
-    """A row a training seed, and one without numbers for each cell that has no records; columns `CSV_COLUMNS`, `plans`,
+    """A row a training seed, and a row without numbers for each cell without records; columns `CSV_COLUMNS`, `plans`,
     `led_by_plan` [%] and `outcomes`."""
     notes: tuple[str, ...]
-    """What was left out, and what is mixed."""
+    """Records that were left out or are mixed."""
 
     @property
     def presets(self) -> list[str]:
@@ -53,7 +53,7 @@ class Results:
 
 
 def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> Results:
-    """Read all records that belong to the table; `presets` are shown even where nothing is recorded of them."""
+    """Read all records of the table; it shows `presets` even without records."""
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     for preset in PRESETS:
@@ -67,9 +67,7 @@ def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> 
     for number, row in runs.iterrows():
         rates = runs[(runs[KEY] == row[KEY]).all(axis=1)]["success_percent"].dropna()
         mean, spread = mean_and_spread(list(rates)) if len(rates) else (None, None)
-        paper = TABLE_1.get((row["task"], row["method"]))
-        reported = (None, None) if paper is None else (paper.mean, paper.deviation)
-        runs.loc[number, SPREAD] = [len(rates), mean, spread, *reported]
+        runs.loc[number, SPREAD] = [len(rates), mean, spread, *TABLE_1.get((row["task"], row["method"]), (None, None))]
     whole = ["train_seed", "episodes", "successes", "seeds", "paper_percent", "paper_deviation_percent"]
     real = [name for name in (*NUMBERS, *SPREAD, *COST) if name not in whole]
     runs = runs.astype(dict.fromkeys(whole, "Int64") | dict.fromkeys(real, float))
@@ -77,7 +75,7 @@ def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> 
 
 
 def _runs(cell: Cell, root: Path, episodes: int, notes: list[str]) -> Iterator[dict[str, Any]]:
-    """A row for each training seed whose records are whole and of today's config; the others are noted."""
+    """A row for each training seed with all records of today's config; a note for each of the others."""
     files = sorted(cell.records(root).parent.glob("train*.jsonl"), key=lambda path: (len(path.name), path.name))
     for path in (path for path in files if path.stem.removeprefix("train").isdecimal()):
         run = Cell(cell.task, cell.method, cell.preset, int(path.stem.removeprefix("train")))
@@ -100,7 +98,7 @@ def _runs(cell: Cell, root: Path, episodes: int, notes: list[str]) -> Iterator[d
 
 
 def to_csv(results: Results) -> str:
-    """A line a training seed of every cell; a missing cell has a line without numbers."""
+    """A line a training seed; a cell without records has a line without numbers."""
     return results.runs.to_csv(columns=CSV_COLUMNS, index=False, float_format="%.3f", lineterminator="\n")
 
 
@@ -115,9 +113,8 @@ def success(runs: pd.DataFrame) -> str:
 
 
 def published(task: str, method: str) -> str:
-    """`94 ± 3` [%] of the paper; a dash for methods that it does not have."""
-    cell = TABLE_1.get((task, method))
-    return MISSING if cell is None else f"{cell.mean} ± {cell.deviation}"
+    """`94 ± 3` [%] of the paper; a dash for methods that it lacks."""
+    return "{} ± {}".format(*TABLE_1[task, method]) if (task, method) in TABLE_1 else MISSING
 
 
 def matrix(runs: pd.DataFrame) -> pd.DataFrame:
@@ -153,14 +150,14 @@ def to_latex(runs: pd.DataFrame, preset: str) -> str:
 
 
 def _latex(text: str) -> str:
-    """Plain text with what LaTeX takes for commands spelt out."""
+    """Plain text with LaTeX's special characters escaped."""
     for plain, escaped in (("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$"), ("*", r"$^*$"), (MISSING, "--")):
         text = text.replace(plain, escaped)
     return text
 
 
 def planning(runs: pd.DataFrame) -> pd.DataFrame:
-    """How much VELAP plans on each task of one preset, and what it costs; means over the training seeds."""
+    """Number and cost of VELAP's plans on each task of one preset; means over the training seeds."""
     velap = runs[(runs["method"] == "velap") & runs["episodes"].notna()]
     columns = {"plans": "plans an episode", "led_by_plan": "steps led by a plan [%]", "plan_ms_p50": "plan p50 [ms]",
                "plan_ms_p95": "plan p95 [ms]", "mean_steps": "steps an episode", "training_seconds": "training [min]"}
@@ -200,7 +197,7 @@ def _outcomes(runs: pd.DataFrame, method: str) -> Episodes:
 
 
 def _mixed_code(runs: pd.DataFrame) -> Iterator[str]:
-    """Files whose episodes come from several versions of the code, or from changes that no commit holds."""
+    """Files with episodes of several versions of the code, or of uncommitted code."""
     recorded = runs[runs["episodes"].notna()]
     versions_of = dict(zip(recorded["records"], recorded["code_versions"], strict=True))
     for path, versions in versions_of.items():
@@ -214,7 +211,7 @@ def _mixed_code(runs: pd.DataFrame) -> Iterator[str]:
 
 
 def _mixed_checkpoints(runs: pd.DataFrame) -> Iterator[str]:
-    """Methods of one task, preset and training seed that do not share their joint checkpoint."""
+    """Methods of one task, preset and training seed with different joint checkpoints."""
     recorded = runs[runs["episodes"].notna() & (runs["method"] != "random")]
     for (task, preset, seed), group in recorded.groupby(["task", "preset", "train_seed"], sort=False):
         by: dict[str, list[str]] = {}
@@ -228,9 +225,9 @@ def _mixed_checkpoints(runs: pd.DataFrame) -> Iterator[str]:
 
 
 def _shared(cell: Cell, checkpoint: str) -> str:
-    """The weights that a method has in common with the others; empty where the checkpoint that could tell is not here.
+    """Hash of the weights that a method shares with the others; empty if the checkpoint is missing.
 
-    VELAP's records name all of its weights, some of which are its own.
+    VELAP's records hold the hash of all of its weights, some of which are its own.
     """
     if not get_method(cell.method).whole_checkpoint:
         return checkpoint
@@ -241,7 +238,7 @@ def _shared(cell: Cell, checkpoint: str) -> str:
 
 
 def _missing(runs: pd.DataFrame) -> Iterator[str]:
-    """How many cells of each preset have no records."""
+    """Number of empty cells of each preset."""
     for preset, group in runs.groupby("preset", sort=False):
         empty = int((group["seeds"] == 0).sum())
         if empty:

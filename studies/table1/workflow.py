@@ -1,4 +1,4 @@
-"""`velap table 1`: what is there and what is missing; the workflow that makes it; the table."""
+"""`velap table 1`: shows the state of the cells, runs the workflow that completes them, and writes the table."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from velap.threads import usable_cores
 
 NEEDED = ("snakemake", "pandas")
 DONE = Path("runs/table1/done")
-"""Marks of the cells that a workflow has evaluated so far."""
+"""Marks of the cells that the running workflow has evaluated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,14 +32,14 @@ class Table1:
 
     cells: tuple[Cell, ...]
     only: str
-    """What picked the cells, for the workflow."""
+    """The filters that selected the cells, for the workflow."""
     records: Path
     episodes: int
     batch: int
     jobs: int
     """Jobs at once; each has its share of the cores."""
     fresh: bool
-    """Move what belongs to another config aside and make it anew; such cells fail otherwise."""
+    """Move files of another config aside and make them anew; such cells fail otherwise."""
     page: Path
 
     def __post_init__(self) -> None:
@@ -52,13 +52,13 @@ class Table1:
                               "with `pip install -e '.[studies]'` in the checkout.")
 
     def dry_run(self, console: Console) -> None:
-        """Say what is there, what is missing, and which jobs would run."""
+        """Print the state of every cell and the jobs that would run."""
         rows = [(str(cell), self._state(cell)) for cell in self.cells]
         console.print(markdown_rows(("cell", "state"), rows), markup=False, soft_wrap=True)
         self._snakemake("--dry-run", "--quiet", "rules", "host")
 
     def run(self, console: Console) -> None:
-        """Make what is missing, then write the table; raises VelapError at the end when something failed."""
+        """Complete the cells, then write the table; raises VelapError at the end if a cell failed."""
         if self.fresh:
             for cell in self.cells:
                 for path, _ in list(outdated(cell)):
@@ -77,7 +77,7 @@ class Table1:
                              "--fresh to move aside what is outdated; then repeat the command.")
 
     def write(self, console: Console) -> None:
-        """Write the table in every form from the records that are there, and print it."""
+        """Write the table in every format from the existing records, and print it."""
         from studies.table1 import tables
         from studies.table1.page import results_page
 
@@ -95,7 +95,7 @@ class Table1:
         console.print(f"written to {', '.join(map(str, files))}", markup=False, soft_wrap=True)
 
     def _state(self, cell: Cell) -> str:
-        """What is there of a cell, in a few words."""
+        """The state of a cell, in words."""
         state = look(cell, self.records, self.episodes)
         if state.done == self.episodes:
             return "done"
@@ -124,7 +124,7 @@ class Table1:
 
 
 def to_do(cells: Sequence[Cell], records: Path, episodes: int, *, fresh: bool = False) -> list[Cell]:
-    """Cells that lack episodes; those with anything outdated only where it may be made anew (`fresh`)."""
+    """Cells that lack episodes; outdated ones only with `fresh`."""
     found = []
     for cell in cells:
         state = look(cell, records, episodes)
@@ -135,7 +135,7 @@ def to_do(cells: Sequence[Cell], records: Path, episodes: int, *, fresh: bool = 
 
 @contextlib.contextmanager
 def _alone() -> Iterator[int]:
-    """Hold the lock of this table and give its descriptor, which the workflow holds as well: it may outlive its caller."""
+    """Hold the lock of this table; yields its descriptor for the workflow, which may outlive its caller."""
     import fcntl
 
     path = DONE.with_name("lock")
@@ -150,6 +150,6 @@ def _alone() -> Iterator[int]:
 
 
 def _move_aside(path: Path) -> None:
-    """Rename a file or folder to `NAME.old-1`, or the next number that is free."""
+    """Rename a file or folder to `NAME.old-1`, or the next free number."""
     number = next(n for n in range(1, 10_000) if not path.with_name(f"{path.name}.old-{n}").exists())
     path.rename(path.with_name(f"{path.name}.old-{number}"))

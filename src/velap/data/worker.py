@@ -70,6 +70,9 @@ def make_env(env_id: str) -> gym.Env:
 def describe(job: Job) -> dict[str, Any]:
     """Spaces, and a fingerprint of physics and pixels that tells whether shards of another run belong to this one."""
     env, digest = make_env(job.env_id), hashlib.sha256()
+    spec = env.spec
+    if spec is not None and callable(spec.entry_point):  # registered by its class, which JSON cannot hold
+        spec = None
     first = run_trajectory(env, job.recipe, dict(job.shares), job.seed, 0, 0)
     for value in first.values():
         digest.update(np.ascontiguousarray(value).tobytes())
@@ -80,7 +83,7 @@ def describe(job: Job) -> dict[str, Any]:
         "frame_shape": list(first["frames"].shape[1:]),
         "action_low": space.low.tolist(),
         "action_high": space.high.tolist(),
-        "env_spec": env.spec.to_json() if env.spec is not None else None,
+        "env_spec": spec.to_json() if spec is not None else None,
         "extent": list(env.unwrapped.extent) if isinstance(env.unwrapped, Mapped) else [],
     }
 

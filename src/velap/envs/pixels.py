@@ -94,7 +94,7 @@ def _close(key: tuple[Any, ...]) -> None:
 
 
 def _number(context: Any) -> int | None:
-    """The number of a context as an int, whatever kind of integer it is; -1 where it is none."""
+    """The number of a context as an int; -1 for anything that is no integer."""
     try:
         return None if context is None else operator.index(context)
     except TypeError:
@@ -139,8 +139,8 @@ class PixelTask(gymnasium.Env[Frame, NDArray[np.float32]]):
         """Start an episode.
 
         `options` may hold `split`: "train" starts as in data collection, "test" (the default) as in evaluation; and
-        `context`: the number of an initialisation of all but the agent (Table 10), by default drawn anew. Each split numbers
-        its own, no test context is one of the training data. Tasks with one context ignore it.
+        `context`: the number of an initialisation of everything except the agent (Table 10), by default drawn anew. Each
+        split numbers its own contexts; they do not overlap. Tasks with one context ignore it.
         """
         self.start(options, seed)
         return self.render(), {"success": False}

@@ -1,7 +1,7 @@
-"""What an environment may tell beside frames and rewards, one protocol a purpose.
+"""What an environment may offer beside frames and rewards, one protocol a purpose.
 
-Training and evaluation need none of it. Whoever asks says by `isinstance` what it needs, and does without where an
-environment does not have it. Environments are asked through `env.unwrapped`.
+Training and evaluation need none of them. Code that uses one checks `isinstance(env.unwrapped, Protocol)` and works without
+it otherwise.
 
 A action dimension, P position dimensions, C points.
 """
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Positioned(Protocol):
-    """Knows where its agent is: positions are kept with a dataset, and pictures are drawn over them."""
+    """Knows where its agent is. Datasets keep positions, and figures are drawn over them."""
 
     def agent_position(self) -> NDArray[np.float64]:
         """[P] [m]."""
@@ -27,7 +27,7 @@ class Positioned(Protocol):
 
 @runtime_checkable
 class HasTestRegion(Protocol):
-    """Knows where test episodes start: a dataset's card says how many of its successes begin there."""
+    """Knows where test episodes start. A dataset's card counts the successes that begin there."""
 
     def in_test_region(self) -> bool:
         """Is the agent where test episodes start?"""
@@ -35,7 +35,7 @@ class HasTestRegion(Protocol):
 
 @runtime_checkable
 class Expert(Protocol):
-    """Has a scripted expert: `velap study experts` shows that the task can be solved, diagnosis compares with it."""
+    """Has a scripted expert, for `velap study experts` and for diagnosis."""
 
     def expert_action(self) -> NDArray[np.floating[Any]]:
         """The expert's action [A], in the environment's own range."""
@@ -43,15 +43,15 @@ class Expert(Protocol):
 
 @runtime_checkable
 class ScriptedTask(HasTestRegion, Expert, Protocol):
-    """What the behaviour `noisy-expert` asks, which collects demonstrations."""
+    """What the behaviour `noisy-expert` needs to collect demonstrations."""
 
     def expert_distance(self) -> float:
-        """Distance to what the expert acts on in the data [m]; infinite where it stays silent."""
+        """Distance to what the expert acts on in the data [m]; infinite where it does not act."""
 
 
 @runtime_checkable
 class Mapped(Positioned, Protocol):
-    """A world seen from above in which the agent can be put anywhere: figures of latents and plans are drawn over it."""
+    """A world seen from above in which the agent can be placed anywhere. Figures of latents and plans are drawn over it."""
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -66,15 +66,15 @@ class Mapped(Positioned, Protocol):
 
 @runtime_checkable
 class Walled(Protocol):
-    """A block maze: straight lines and true distances can be computed."""
+    """A block maze, in which true distances can be computed."""
 
     layout: Layout
-    """Walls, goal and starts of the present context."""
+    """Walls, goal and starts of the current context."""
 
 
 @runtime_checkable
 class Measured(Protocol):
-    """Knows how far the goal is: diagnosis says how close a failed episode came."""
+    """Knows the distance to the goal. Diagnosis reports how close a failed episode came."""
 
     def geodesic_steps(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Positions [..., P] [m] → shortest ways to the goal [...] [steps]."""
@@ -82,23 +82,23 @@ class Measured(Protocol):
 
 @runtime_checkable
 class WithObjects(Protocol):
-    """Has things that the agent moves: diagnosis says whether a failed episode moved any."""
+    """Has objects that the agent moves. Diagnosis reports whether a failed episode moved any."""
 
     def objects(self) -> NDArray[np.float64]:
-        """Places of all of them [number, 3] [m]."""
+        """Positions of all objects [number, 3] [m]."""
 
 
 @runtime_checkable
 class WithSubtasks(Protocol):
-    """Has to be solved in parts: diagnosis says which of them a failed episode solved."""
+    """Consists of subtasks. Diagnosis reports which of them a failed episode solved."""
 
     def subtasks(self) -> tuple[bool, ...]:
-        """Which parts are solved."""
+        """Which subtasks are solved, in their order."""
 
 
 @runtime_checkable
 class WithTrueState(Protocol):
-    """Knows all that pictures show: `velap study exact-latents` learns from that instead of pictures."""
+    """Knows the state that frames show. `velap study exact-latents` learns from it instead of frames."""
 
     def true_state(self) -> NDArray[np.float32]:
         """[number]."""

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from velap.training.steps import Progress as TrainProgress
 
 LINE_EVERY = 15.0
-"""Seconds between progress lines where the output is no terminal [s]."""
+"""Time between progress lines without a terminal [s]."""
 
 
 class ProgressBar:
-    """A progress bar with a text beside it; where the output is no terminal, a line now and then and one at the end."""
+    """A progress bar with a text beside it; without a terminal, a line every `LINE_EVERY` and one at the end."""
 
     def __init__(self, console: Console, title: str, total: int) -> None:
         self._console, self._title, self._total = console, title, total
@@ -42,7 +42,7 @@ class ProgressBar:
                                 soft_wrap=True)
 
     def _left(self, done: int, now: float) -> str:
-        """How much longer it takes at the pace so far."""
+        """Remaining time at the pace so far."""
         first, start = self._first or (done, now)
         if done <= first or done >= self._total:
             return ""
@@ -58,7 +58,7 @@ class ProgressBar:
 
 
 class TrainingBar(ProgressBar):
-    """Steps and losses of training runs, one after the other; each report brings its total."""
+    """Steps and losses of successive training runs; each report has its own total."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(console, "training", 1)
@@ -77,7 +77,7 @@ class EpisodeBar(ProgressBar):
         self._episodes = self._solved = self._steps = 0
 
     def step(self, row: int) -> None:
-        """One more environment step of `row`; shown with row 0, between the episodes' ends."""
+        """One more environment step of `row`; row 0 updates the bar."""
         if row == 0:
             self._steps += 1
             self.show(self._episodes, f"{self._solved} solved, step {self._steps}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from pathlib import Path
@@ -33,12 +33,12 @@ BATCH = 10
 
 
 AS_THE_TASKS = Reading()
-"""How the data of checkpoints were read that do not say it: square images, rewards 0 and 1."""
+"""Reading of checkpoints that do not keep one: square images, rewards 0 and 1."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What to evaluate, and where."""
+    """Method, checkpoint and environment of an evaluation."""
 
     task: str
     """Task name; with `env`, any label."""
@@ -47,28 +47,28 @@ class Evaluation:
     checkpoint: Path | None = None
     """`model.safetensors` of a run; `random` needs none."""
     preset: str = "default"
-    """Names the records of a method without a checkpoint; a checkpoint brings its own."""
+    """Preset of a method without a checkpoint; a checkpoint has its own."""
     env: str | None = None
     """Any Gymnasium id, `module:Env-v0` included, instead of the task's own."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Arguments of `gymnasium.make` besides the id."""
     image_key: str | None = None
-    """Key of the image in dict observations; None takes the one that the checkpoint keeps, where the environment has it."""
+    """Key of the image in dict observations; None: the checkpoint's, if the environment has it."""
     max_steps: int | None = None
-    """Time limit [steps], if it is shorter than the environment's own or the environment has no limit."""
+    """Time limit, if the environment has none, or a shorter one [steps]."""
     success: str | None = None
-    """What counts as success, a rule of `velap.data.success`; None takes the one that the checkpoint keeps."""
+    """What counts as success, a rule of `velap.data.success`; None: the checkpoint's."""
     device: str = "auto"
     changes: Mapping[str, Mapping[str, Any]] | None = None
     """Fields of the checkpoint's config to replace, `{"planner": {"n_iter": 500}}`, or of the method's own settings,
     `{"mppi": {"temperature": 1.0}}`."""
     head: Path | None = None
-    """What the method learnt beside the checkpoint; None looks for `<method>.safetensors` in the checkpoint's folder."""
+    """File of what the method learnt beside the checkpoint; None: `<method>.safetensors` in the checkpoint's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Player:
-    """A loaded method: the agent, the environments that it can act in, and what its records say."""
+    """A loaded method: its agent, its environments and the identity of its records."""
 
     agent: Agent
     model: LatentModel | None
@@ -78,15 +78,15 @@ class Player:
     image_size: int
     """Side of the images that the agent takes [px]."""
     reading: Reading = AS_THE_TASKS
-    """How the data were read that the model learnt from."""
+    """How the training data were read."""
 
     @property
     def success(self) -> Success | None:
-        """What counts as success; None: what the environment's info says, else a positive reward."""
+        """What counts as success; None: the environment's info, else a positive reward."""
         return None if self.key.success_rule is None else Success.parse(self.key.success_rule)
 
     def frames_of(self, env: gym.Env[Any, Any]) -> FrameReader:
-        """The reader of an environment's frames, which squares and resizes them as it was done with the data."""
+        """The reader of an environment's frames, which squares and resizes them as the training data were."""
         return FrameReader(env, self.image_size, self.key.image_key, self.reading.fit)
 
     @property
@@ -97,15 +97,19 @@ class Player:
         device = next(self.model.parameters()).device
         return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
-    def rollout(self, batch: int, observer: Observer | None = None) -> Rollout:
-        """A rollout over `batch` new environments."""
-        envs = make_envs(self.make_env, batch)
-        return Rollout(envs, self.agent, self.frames_of(envs[0]), reset_options=reset_options(envs[0]),
-                       max_steps=self.key.max_steps, success=self.success, observer=observer)
+    def episodes(self, seeds: Sequence[int], batch: int = BATCH, observer: Observer | None = None) -> Iterator[Episode]:
+        """Run every seed once, up to `batch` at a time; yields episodes in the order of finishing."""
+        envs = make_envs(self.make_env, min(batch, len(seeds)))
+        try:
+            yield from Rollout(envs, self.agent, self.frames_of(envs[0]), reset_options=reset_options(envs[0]),
+                               max_steps=self.key.max_steps, success=self.success, observer=observer).run(seeds)
+        finally:
+            for env in envs:
+                env.close()
 
 
 def reset_options(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
-    """What makes the environment of a task start as in evaluation; nothing for others."""
+    """Options that make the environment of a task start as in evaluation; None for other environments."""
     ids = {task.env_id.rpartition(":")[2] for task in TASKS.imported.values()}
     return {"split": "test"} if env.spec is not None and env.spec.id in ids else None
 
@@ -139,7 +143,7 @@ def load_player(what: Evaluation) -> Player:
 
 
 def _time_limit(env: gym.Env[Any, Any], asked: int | None) -> int:
-    """The shorter one of the environment's time limit and the one asked for [steps]."""
+    """The shorter of the environment's time limit and the requested one [steps]."""
     own = env.spec.max_episode_steps if env.spec is not None else None
     limits = [limit for limit in (own, asked) if limit is not None]
     if not limits or min(limits) < 1:
@@ -149,21 +153,21 @@ def _time_limit(env: gym.Env[Any, Any], asked: int | None) -> int:
 
 
 class LoadedMethod(NamedTuple):
-    """What a method reads from disk, and how it plans."""
+    """What a method reads from disk, and its settings."""
 
     model: LatentModel | None
     config: Config
     seed: int
     """Training seed."""
     digest: str
-    """Hash of the joint weights, for other methods than VELAP of those that all share."""
+    """Hash of the weights that the method acts by: VELAP's are all of the checkpoint, other methods share a part."""
     head: Head | None = None
     settings: Any = None
     reading: Reading = AS_THE_TASKS
 
 
 def load_method(what: Evaluation) -> LoadedMethod:
-    """Checkpoint, head and settings of the method, with the changes that are asked for; a bare config for `random`."""
+    """Checkpoint, head and settings of the method, with the requested changes; the preset's config for `random`."""
     from velap.config import override
     from velap.training.loop import pick_device
 
@@ -191,7 +195,7 @@ def load_method(what: Evaluation) -> LoadedMethod:
 
 
 def make_env(env_id: str, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, Any]:
-    """The Gymnasium environment of that id, in the render mode `rgb_array` where it has one.
+    """The Gymnasium environment of that id, in the render mode `rgb_array` if it has one.
 
     Raises UnknownTaskError when Gymnasium cannot make it, ConfigError when it refuses its arguments.
     """
@@ -226,7 +230,7 @@ def _checked_actions(env: gym.Env[Any, Any], model: LatentModel | None) -> gym.s
 def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATCH, fresh: bool = False,
              on_record: Callable[[Record], None] = lambda record: None,
              player: Player | None = None) -> list[Record]:
-    """Run every seed that is not recorded yet and return the records of all `seeds`, in their order.
+    """Run every seed without a record and return the records of all `seeds`, in their order.
 
     Args:
         what: method, checkpoint and environment.
@@ -234,8 +238,8 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
         records: root of the record files.
         batch: environments at once.
         fresh: move an existing record file aside first.
-        on_record: called for every record, those found on disk first.
-        player: `load_player(what)` where the caller has it already.
+        on_record: called for every record; existing records come first.
+        player: `load_player(what)` if the caller has it.
     """
     if len(seeds) == 0 or batch < 1:
         raise ConfigError(f"got {len(seeds)} episodes in batches of {batch}; expected at least one of each.")
@@ -249,7 +253,7 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
         missing = [seed for seed in seeds if seed not in file.done]
         if missing:
             batch = min(batch, len(missing))
-            for episode in player.rollout(batch).run(missing):
+            for episode in player.episodes(missing, batch):
                 record = to_record(player.key, episode, batch, player.device)
                 file.append(record)
                 on_record(record)
@@ -259,7 +263,7 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
 def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str, Any] | None = None,
          image_key: str | None = None, max_steps: int | None = None, success: str | None = None,
          image_size: int = IMAGE_SIZE, batch: int = BATCH) -> list[Record]:
-    """Records of an agent's episodes, one a seed, which are kept nowhere.
+    """Run an agent's episodes and return their records, one a seed, without writing them.
 
     Args:
         agent: anything that acts as `velap.methods.base.Agent` does.
@@ -267,8 +271,8 @@ def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str
         seeds: episode seeds; test seeds are 0 to 99.
         env_kwargs: arguments of `gymnasium.make` besides the id.
         image_key: key of the image in dict observations.
-        max_steps: time limit where the environment has none, or a shorter one [steps].
-        success: what success is, a rule of `velap.data.success`; None: the info's word, else a positive reward.
+        max_steps: time limit, if the environment has none, or a shorter one [steps].
+        success: what counts as success, a rule of `velap.data.success`; None: the info's `success`, else a positive reward.
         image_size: side of the images that the agent takes [px].
         batch: environments at once.
     """
@@ -278,20 +282,18 @@ def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str
     if len(seeds) == 0 or batch < 1:
         raise ConfigError(f"got {len(seeds)} episodes in batches of {batch}; expected at least one of each.")
     env_id = TASKS[env].env_id if env in TASKS else env
-    batch = min(batch, len(seeds))
-    envs = make_envs(lambda: make_env(env_id, env_kwargs), batch)
+    first = make_env(env_id, env_kwargs)
     try:
-        key = RunKey(task=env, method=agent.method, preset="none", train_seed=0, env=env_id, config_hash="", checkpoint="",
-                     code_version=code_version(), env_kwargs=dict(env_kwargs or {}), image_key=image_key,
-                     max_steps=_time_limit(envs[0], max_steps), success_rule=success)
-        rule = None if success is None else Success.parse(success)
-        rollout = Rollout(envs, agent, FrameReader(envs[0], image_size, image_key, None), max_steps=key.max_steps,
-                          reset_options=reset_options(envs[0]), success=rule)
-        return [to_record(key, each, batch, device="")
-                for each in sorted(rollout.run(seeds), key=lambda each: each.seed)]
+        limit = _time_limit(first, max_steps)
     finally:
-        for made in envs:
-            made.close()
+        first.close()
+    key = RunKey(task=env, method=agent.method, preset="none", train_seed=0, env=env_id, config_hash="", checkpoint="",
+                 code_version=code_version(), env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=limit,
+                 success_rule=success)
+    player = Player(agent=agent, model=None, config=Config(task=env, preset="none"), key=key, image_size=image_size,
+                    make_env=lambda: make_env(env_id, env_kwargs))
+    return [to_record(key, each, min(batch, len(seeds)), device="")
+            for each in sorted(player.episodes(seeds, batch), key=lambda each: each.seed)]
 
 
 def to_record(key: RunKey, episode: Episode, batch: int, device: str) -> Record:

@@ -27,10 +27,10 @@ SCHEMA = 2
 """Version of a line. Schema 1 had no `schema` and none of `_NEW_IN_2`."""
 IDENTITY = ("task", "method", "preset", "train_seed", "env", "env_kwargs", "image_key", "max_steps", "success_rule",
             "config_hash", "checkpoint")
-"""Fields that every record of one file shares."""
+"""Fields that are equal in all records of a file."""
 _NEW_IN_2: dict[str, Any] = {"env_kwargs": {}, "image_key": None, "success_rule": None, "batch": None, "device": None,
                              "plan_steps": None}
-"""Fields that schema 1 did not have, with what its records stand for: no options, and an unknown batch and device."""
+"""Fields that schema 1 lacks, with their values in its records: no options, and an unknown batch and device."""
 
 
 def record_path(root: Path, task: str, method: str, preset: str, train_seed: int) -> Path:
@@ -41,7 +41,7 @@ def record_path(root: Path, task: str, method: str, preset: str, train_seed: int
 
 @dataclass(frozen=True, kw_only=True)
 class RunKey:
-    """What decides the result of an episode besides its seed."""
+    """Everything that decides the result of an episode except its seed."""
 
     task: str
     """Task name; the environment id where `--env` named one."""
@@ -52,17 +52,17 @@ class RunKey:
     """Gymnasium id."""
     config_hash: str
     checkpoint: str
-    """SHA-256 of the weights that the method acts by [hex]; empty for methods without any."""
+    """SHA-256 of the weights that the method acts by [hex]; empty for methods without weights."""
     code_version: str
-    """Package version and commit; may differ between the records of one file."""
+    """Package version and commit; may differ between records of a file."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Arguments of `gymnasium.make` besides the id."""
     image_key: str | None = None
     """Key of the image in dict observations."""
     max_steps: int | None = None
-    """Time limit [steps]; None only in records of schema 1 that do not tell it."""
+    """Time limit [steps]; None if unknown, in some records of schema 1."""
     success_rule: str | None = None
-    """What counts as success, a rule of `velap.data.success`; None: the info's word, else a positive reward."""
+    """What counts as success, a rule of `velap.data.success`; None: the environment's info, else a positive reward."""
 
     def path(self, root: Path) -> Path:
         """Its record file below `root`."""
@@ -80,7 +80,7 @@ class Record(RunKey):
     truncated: bool
     """Ended by the time limit."""
     plan_ms: tuple[float, ...]
-    """Every plan's time [ms]: its row's share of the batch that planned together."""
+    """Time of each plan [ms]: the row's share of the batch that planned together."""
     plan_steps: int | None
     """Steps whose action followed an edge of the current tree [steps]; None for methods without a tree, and in schema 1."""
     batch: int | None
@@ -113,8 +113,8 @@ class Record(RunKey):
 def _from_schema_1(raw: dict[str, Any]) -> dict[str, Any]:
     """A line of schema 1 with the fields of schema 2.
 
-    An episode that ran out of time tells the limit; for the others it is that of the task's environment, and unknown (None)
-    for an environment of someone else.
+    The time limit is the length of an episode that ran out of time, else that of the task's environment, else unknown
+    (None).
     """
     limit = raw.get("steps") if raw.get("truncated") else _time_limit_of(str(raw.get("env")))
     return {**raw, **_NEW_IN_2, "max_steps": limit, "schema": 1}
@@ -122,17 +122,17 @@ def _from_schema_1(raw: dict[str, Any]) -> dict[str, Any]:
 
 @cache
 def _time_limit_of(env_id: str) -> int | None:
-    """The time limit of the task with that environment [steps]; None for an environment of someone else."""
+    """The time limit of the task with that environment [steps]; None for other environments."""
     return next((task.max_steps for task in TASKS.values() if task.env_id == env_id), None)
 
 
 def read_records(path: Path) -> list[Record]:
-    """All whole records of a file; a torn last line is left out. Raises RecordError on damage elsewhere or doubled seeds."""
+    """All complete records of a file, without a torn last line. Raises RecordError on other damage or doubled seeds."""
     return _parse(path, path.read_bytes())[0]
 
 
 def _parse(path: Path, payload: bytes) -> tuple[list[Record], int]:
-    """The records of `payload` and the length of its sound beginning [bytes]."""
+    """The records of `payload` and the length of its undamaged beginning [bytes]."""
     records: list[Record] = []
     sound = 0
     for number, line in enumerate(payload.splitlines(keepends=True), start=1):
@@ -172,7 +172,7 @@ class RecordFile:
             self._opened = opened.pop_all()
 
     def _resume(self) -> list[Record]:
-        """The records already there, all of this run; a torn end is cut off."""
+        """The existing records, all of this run; a torn end is cut off."""
         self._stream.seek(0)
         records, sound = _parse(self.path, self._stream.read())
         self._stream.truncate(sound)
@@ -207,15 +207,11 @@ class RecordFile:
                 raise
         self.records.append(record)
 
-    def close(self) -> None:
-        """Release the file and its lock."""
-        self._opened.close()
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self.close()
+        self._opened.close()
 
 
 def _free_name(path: Path) -> Path:
@@ -232,7 +228,7 @@ def _another_way_to_act(name: str) -> str:
 
 
 def check_config(path: Path, config_hash: str) -> None:
-    """Raises RecordError where a file already holds records of another config: better before a training than after it."""
+    """Raises RecordError if a file holds records of another config: called before a training rather than after it."""
     found = {record.config_hash for record in read_records(path)} if path.exists() else {config_hash}
     if found - {config_hash}:
         raise RecordError(f"{path} holds records of another config ({', '.join(sorted(found))}, now {config_hash})."

@@ -57,14 +57,14 @@ class Moment:
 
 
 Observer = Callable[[Moment], None]
-"""Sees every state of every running episode."""
+"""Receives every state of every running episode."""
 
 
 class FrameReader:
     """Observations of one environment -> images uint8 [side, side, 3], by the rules that datasets are read by."""
 
     def __init__(self, env: gym.Env[Any, Any], side: int, image_key: str | None = None, fit: Fit | None = None) -> None:
-        """`fit` says how oblong images become square, as those of the dataset did."""
+        """`fit` is how the dataset's oblong images became square."""
         self._name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
         self._layout = find_image(env.observation_space, image_key, self._name, NO_PIXELS, fit)
         self._side, self._fit = side, fit
@@ -100,7 +100,7 @@ class _Running:
 class Rollout:
     """Runs an agent through episodes in B environments; a row that finishes takes the next seed.
 
-    Once the seeds are used up, finished rows keep showing the agent their last state and their actions go nowhere.
+    Without seeds left, a finished row keeps its last state, and its actions are ignored.
     """
 
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], agent: Agent, read: FrameReader, *,
@@ -116,7 +116,7 @@ class Rollout:
         self._observer = observer
 
     def run(self, seeds: Iterable[int]) -> Iterator[Episode]:
-        """Every seed once, yielded in the order of finishing."""
+        """Run every seed once; yields episodes in the order of finishing."""
         queue = deque(seeds)
         batch = min(len(self._envs), len(queue))
         rows: list[_Running | None] = [None] * batch
@@ -137,7 +137,7 @@ class Rollout:
                     yield episode
 
     def _start(self, rows: list[_Running | None], queue: deque[int]) -> None:
-        """Give every free row the next seed."""
+        """Start the next seed in every free row."""
         mask = np.zeros(len(rows), bool)
         seeds = np.zeros(len(rows), np.int64)
         for index, row in enumerate(rows):
@@ -150,7 +150,7 @@ class Rollout:
             self._agent.reset(mask, seeds)
 
     def _step(self, index: int, row: _Running, action: NDArray[np.float32]) -> Episode | None:
-        """One transition of row `index`; the episode if it ended."""
+        """One transition of row `index`; returns the episode if it ended."""
         env = self._envs[index]
         if np.isfinite(self._agent.last_plan_ms[index]):
             row.plan_ms.append(float(self._agent.last_plan_ms[index]))
@@ -187,6 +187,6 @@ def make_envs(make: Callable[[], gym.Env[Any, Any]], count: int) -> list[gym.Env
 
 
 def play_without_frames(world: Any, act: Callable[[], NDArray[np.floating[Any]]], seed: int, max_steps: int) -> int | None:
-    """Steps to success of a task of ours from the test start of that seed; None without success by `max_steps` [steps]."""
+    """Steps to success in a task of velap from the test start of that seed; None without success in `max_steps` [steps]."""
     world.start({"split": "test"}, seed)
     return next((step for step in range(1, max_steps + 1) if world.advance(act())), None)

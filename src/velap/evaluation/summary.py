@@ -1,4 +1,4 @@
-"""Statistics and tables, computed from episode records and from nothing else."""
+"""Statistics and tables, computed from episode records alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Episodes = Mapping[tuple[int, int], bool]
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """What the records of one run say."""
+    """Statistics of one run's records."""
 
     task: str
     method: str
@@ -40,9 +40,9 @@ class Summary:
     mean_plans: float
     """Mean number of plans an episode."""
     plan_share: float
-    """Share of all steps whose action followed an edge of the current tree, NaN where it is not recorded [fraction]."""
+    """Share of all steps whose action followed an edge of the current tree, NaN if not recorded [fraction]."""
     plan_ms_p50: float
-    """Median planning time, NaN where nothing was planned [ms]."""
+    """Median planning time, NaN without plans [ms]."""
     plan_ms_p95: float
     code_versions: tuple[str, ...]
 
@@ -80,7 +80,7 @@ def summarise(records: Sequence[Record]) -> Summary:
 
 
 def _plan_share(records: Sequence[Record]) -> float:
-    """Share of the steps led by a plan; NaN unless every record tells."""
+    """Share of the steps led by a plan; NaN unless every record has it."""
     led = [record.plan_steps for record in records if record.plan_steps is not None]
     return sum(led) / sum(record.steps for record in records) if len(led) == len(records) else math.nan
 
@@ -102,16 +102,16 @@ class Paired:
     """Solved by the first method and not by the second."""
     only_second: int
     p_value: float
-    """Two-sided; 1 where no pair is discordant."""
+    """Two-sided; 1 without discordant pairs."""
 
     @property
     def discordant(self) -> int:
-        """Pairs in which exactly one method succeeds: the test rests on them alone."""
+        """Pairs in which exactly one method succeeds: only these count."""
         return self.only_first + self.only_second
 
 
 def mcnemar(first: Episodes, second: Episodes) -> Paired:
-    """Compare two methods on the episodes that both have; raises RecordError where they share none.
+    """Compare two methods on their common episodes; raises RecordError without any.
 
     Exact form: under equal success rates each discordant pair falls to either side with probability 1/2.
     """
@@ -143,18 +143,18 @@ def cells(summary: Summary) -> tuple[str, ...]:
 
 
 def summary_text(summary: Summary) -> str:
-    """One run, a line a number."""
+    """One run, one line a number."""
     width = max(map(len, COLUMNS))
     return "\n".join(f"{name:{width}}  {cell}" for name, cell in zip(COLUMNS, cells(summary), strict=True))
 
 
 def markdown_table(summaries: Iterable[Summary]) -> str:
-    """A line a run, for documents, terminals and log files alike."""
+    """One line a run, in Markdown."""
     return markdown_rows(COLUMNS, [cells(summary) for summary in summaries])
 
 
 def markdown_rows(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table whose columns stand below each other."""
+    """A Markdown table with aligned columns."""
     widths = [max(3, *(len(line[index]) for line in (columns, *rows))) for index in range(len(columns))]
     lines = [columns, ["-" * width for width in widths], *rows]
     return "\n".join("| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |"
@@ -172,7 +172,7 @@ def summarise_all(root: Path) -> list[Summary]:
 
 
 def write_into(document: Path, table: str) -> None:
-    """Replace what stands between the two table marks of `document`."""
+    """Replace the text between the two table marks of `document`."""
     text = document.read_text() if document.is_file() else ""
     if text.count(TABLE_START) != 1 or text.count(TABLE_END) != 1:
         raise RecordError(f"{document} has no place for the table; put the lines {TABLE_START!r} and {TABLE_END!r} where it "

@@ -1,10 +1,10 @@
-"""Networks for shooting: normalisation folded into the weights, hidden layers in half precision where that is wanted.
+"""Networks for shooting: normalisation folded into the weights, hidden layers optionally in half precision.
 
 `*` is any batch prefix, n the members. With thousands of rows a call the arithmetic is the cost, not the module machinery
 that `inference.py` avoids. Layer normalisation is the slow part beside the products: its centring and its gain are linear,
 so they move into the weights before and after, and one root mean square a row is left. Batch normalisation folds away.
 
-The weights are copied: build the functions anew after any change of weights.
+The functions copy the weights: build them anew after a change of weights.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from velap.models.networks import LEAK, MLP, EnsembleMLP
 
 Forward = Callable[..., Tensor]
 SMALLEST_GAIN = 1e-6
-"""Least size of a gain; gains are divided by."""
+"""Smallest gain: gains are divisors."""
 
 
 class Dense(NamedTuple):
@@ -35,7 +35,7 @@ class Dense(NamedTuple):
 
 
 class Folded(NamedTuple):
-    """A dense layer; behind it, where `shift` is given, division by the row's root mean square and that shift."""
+    """A dense layer, followed by division by the row's root mean square and `shift` if that is given."""
 
     weight: Tensor
     bias: Tensor
@@ -153,7 +153,7 @@ def _hidden(layers: Sequence[Folded], dtype: torch.dtype, affine: Callable[[Tens
 
 
 def _activate(y: Tensor, shift: Tensor | None) -> Tensor:
-    """Normalisation, where there is one, and LeakyReLU of `y` [..., V]."""
+    """Normalisation, if `shift` is given, and LeakyReLU of `y` [..., V]."""
     if shift is not None:
         norm = torch.linalg.vector_norm(y, dim=-1, keepdim=True)
         width = y.shape[-1]

@@ -1,8 +1,8 @@
 """`kernels.c`: networks on a few dozen rows, where PyTorch spends its time between the kernels.
 
-The C compiler of the machine builds it at first use, into the user's cache. Without a compiler a warning says how to install
-one, and the networks of `inference.py` run, equal up to rounding; a plan then takes about twice as long. They also run on
-other devices than a CPU. `VELAP_NATIVE=0` turns the C code off, without a warning. W inputs, V outputs, n members.
+The machine's C compiler builds it at first use, into the user's cache. Without a compiler a warning says how to install one,
+and the networks of `inference.py` run instead, equal up to rounding; a plan then takes about twice as long. They also run on
+other devices than a CPU. `VELAP_NATIVE=0` turns the C code off without a warning. W inputs, V outputs, n members.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class _Layer(ctypes.Structure):
 
 @cache
 def library() -> ctypes.CDLL | None:
-    """The compiled code; None where it is turned off, and, with one warning, where it cannot be built."""
+    """The compiled code; None if it is turned off, or, with one warning, if it cannot be built."""
     if os.environ.get("VELAP_NATIVE") == "0":
         return None
     named = os.environ.get("CC")
@@ -70,7 +70,7 @@ def library() -> ctypes.CDLL | None:
 
 
 def _build(compiler: str) -> Path:
-    """Path of the library for this source, compiler and processor; built when it is not there yet."""
+    """Path of the library for this source, compiler and processor; builds it if it does not exist."""
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "velap"
     digest = hashlib.sha256("\0".join((_SOURCE.read_text(), compiler, *FLAGS, _processor())).encode()).hexdigest()[:16]
     path = root / f"native-{digest}.so"
@@ -103,7 +103,7 @@ def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
 
 
 def _library_for(layers: Sequence[Folded]) -> ctypes.CDLL | None:
-    """The library, where it can run these layers."""
+    """The library if it can run these layers."""
     fits = all(part.dtype == torch.float32 and part.device.type == "cpu" for layer in layers for part in layer[:2])
     narrow = max(size for layer in layers for size in layer.weight.shape[-2:]) <= MOST_UNITS
     return library() if fits and narrow else None
@@ -117,7 +117,7 @@ def _width(layers: Sequence[Folded]) -> int:
 def native_network(layers: Sequence[Folded], otherwise: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Inputs `[*, W_1], [*, W_2], ...`, taken side by side, → `[n, *, V]` of the members, or `[*, V]` of weights [W, V].
 
-    `otherwise` gets what kernels.c cannot take (other devices and types, more rows than pay) and must give the same. The
+    `otherwise` computes the same; it runs for inputs that kernels.c does not take (other devices, types, many rows). The
     weights are copied.
     """
     found = _library_for(layers)
@@ -154,7 +154,7 @@ def native_rollout(
     """`z [R, D], noise [R, S, m], steps → z [R, D]` after that number of steps with the actions tanh(acting(z, noise)).
 
     The noise of step i is number min(i, S - 1); `acting` without noise takes m = 0. `moving(z, action)` is the next latent,
-    or with `residual` the change. None where kernels.c cannot take the layers. The weights are copied.
+    or with `residual` the change. None if kernels.c cannot run the layers. The weights are copied.
     """
     found = _library_for([*acting, *moving])
     if found is None:

@@ -107,7 +107,7 @@ def planned(plans: search.Path, row: int) -> Planned:
 
 
 def can_probe(env: gym.Env[Any, Any]) -> bool:
-    """Whether the environment can put its robot where it is told and says what its camera sees."""
+    """Whether the environment can place its robot anywhere and knows what its camera sees."""
     return isinstance(env.unwrapped, Mapped)
 
 

@@ -1,4 +1,4 @@
-"""`velap inspect`: the card of a stranger's dataset, and what will not work with it, before an hour of training is spent."""
+"""`velap inspect`: the card of a dataset and its problems, before an hour of training is spent."""
 
 from __future__ import annotations
 
@@ -24,43 +24,43 @@ from velap.runs import write_atomic
 
 PAGE, FIGURES = "inspection.md", "inspection.json"
 FEW_SUCCESSES = 10
-"""ours: one held-out success in ten is one episode."""
+"""Fewest successful episodes. ours: one in ten is held out."""
 FEW_TRANSITIONS = 5_000
-"""ours: a tenth of the smallest dataset of Table 10."""
+"""Fewest transitions. ours: a tenth of the smallest dataset of Table 10."""
 MUCH_AT_BOUND = 0.6
-"""ours: the shipped datasets have up to 0.31 of an entry at its bounds."""
+"""Largest share of an action entry at its bounds. ours: the shipped datasets have up to 0.31."""
 SMALL_RANGE = 0.2
-"""Share of the stated range that actions should use at least. ours."""
+"""Smallest share of the stated range that actions use. ours."""
 JITTER = 0.1
-"""Autocorrelation of lag 1 below which actions are noise. ours: the shipped datasets have 0.8 and more."""
+"""Smallest autocorrelation of actions at lag 1. ours: the shipped datasets have 0.8 and more."""
 MANY_EQUAL = 0.5
-"""Share of equal subsequent frames that is too much. ours: ObstacleMaze, whose ball can be stuck, has 0.10."""
+"""Largest share of frames equal to the one before. ours: ObstacleMaze, whose block can be stuck, has 0.10."""
 LITTLE_CONTRAST = 4.0
-"""[grey levels] ours."""
+"""Smallest standard deviation within a frame [grey levels]. ours."""
 OUT_OF_REACH = 0.05
-"""Share of the failed episodes whose start has a way to a success, below which nothing can be stitched. ours."""
+"""Smallest share of the failed episodes from whose start recorded frames lead to a success. ours."""
 LONELY = 0.5
-"""Share of frames that no other episode comes near, above which coverage is thin. ours: ObstacleMaze has 0.27."""
+"""Largest share of frames that no other episode comes near. ours: ObstacleMaze has 0.27."""
 MOST = 0.5
-"""Share of the successes that makes an oddity of theirs a fault. ours."""
+"""An oddity of a larger share of the episodes is a problem. ours."""
 SHOWN = 24
-"""Backgrounds and lonely frames in pictures at most."""
+"""Most backgrounds and lonely frames in a picture."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something that will not work, or not well."""
+    """A reason why training will fail or work badly."""
 
     name: str
     got: str
     expected: str
     do: str
     stops: bool = False
-    """Training refuses the dataset."""
+    """Whether training refuses the dataset."""
 
     @classmethod
     def of_error(cls, name: str, error: DatasetError) -> Problem:
-        """What an error says, which is written as `got; expected. do`."""
+        """From an error whose text has the form `got; expected. do`."""
         got, _, rest = str(error).partition("; expected ")
         expected, _, advice = rest.partition(". ")
         return cls(name, got, expected, advice, stops=True)
@@ -71,11 +71,11 @@ class Problem:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found in a dataset."""
+    """The findings of one dataset."""
 
     dataset: str
     store: FrameStore | None
-    """None where it cannot be read."""
+    """None if it cannot be read."""
     survey: Survey | None
     notes: tuple[str, ...]
     """Changes made to the data while reading."""
@@ -84,7 +84,7 @@ class Inspection:
 
 def inspect(source: str, *, image_key: str | None = None, image_size: int = IMAGE_SIZE, fit: Fit | None = None,
             success: str | None = None, mapped: bool | None = None) -> Inspection:
-    """Read and measure a dataset; arguments as for `load_store`. What cannot be read becomes a problem too."""
+    """Read and measure a dataset; arguments as for `load_store`. A dataset that cannot be read has that as its problem."""
     problems = []
     options: dict[str, Any] = {"image_key": image_key, "image_size": image_size, "fit": fit, "success": success,
                                "mapped": mapped}
@@ -105,7 +105,7 @@ def inspect(source: str, *, image_key: str | None = None, image_size: int = IMAG
 
 
 def find_problems(store: FrameStore, found: Survey) -> list[Problem]:
-    """What will not work, in the order of how much it matters."""
+    """All problems; those that stop a training come first."""
     problems = [*_length_problems(store), *_success_problems(store, found.coverage), *_frame_problems(found),
                 *_action_problems(store, found.actions), *_coverage_problems(found.scenes, found.coverage)]
     return sorted(problems, key=lambda problem: not problem.stops)
@@ -148,7 +148,7 @@ def _success_problems(store: FrameStore, coverage: Coverage | None) -> Iterator[
 
 
 def _goal_problems(coverage: Coverage) -> Iterator[Problem]:
-    """What the frames of success look like, and whether they can be reached."""
+    """Problems of the frames of success."""
     if coverage.jumps > MOST:
         yield Problem("success-frame-jumps",
                       got=f"in {coverage.jumps:.0%} of the successful episodes the last step changes the frame by more than "
@@ -239,7 +239,7 @@ def inspection_text(inspection: Inspection) -> str:
 
 
 def _described(store: FrameStore, found: Survey) -> list[str]:
-    """What was measured, one line each."""
+    """The measurements, one line each."""
     won = episode_returns(store) > 0
     actions = found.actions
     lags = [f"{actions.autocorrelation[lag]:.2f} after {lag}" for lag in (1, 2, 5, 10)

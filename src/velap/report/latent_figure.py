@@ -1,6 +1,6 @@
 """Figure 3 (Sec. 5.1): a latent space in the plane, Q^g in it and over the world, and planned paths.
 
-`of_env` and `of_data` find out what a row of the figure shows, `save` keeps rows in one small file, `draw` draws that.
+`of_env` and `of_data` compute a row of the figure, `save` writes rows into one small file, and `draw` draws them.
 
 P states, D latent dimensions, R paths, L nodes of the longest one, M nodes of a tree, C landmarks, S frame size [px].
 """
@@ -17,8 +17,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from velap.data.frames import Reading
-from velap.data.loading import load_store
 from velap.data.sampling import WindowSampler
 from velap.envs.protocol import Mapped
 from velap.errors import DatasetError
@@ -26,6 +24,7 @@ from velap.evaluation.evaluate import Evaluation, load_player, make_env
 from velap.methods.provenance import search_of
 from velap.methods.states import StateEncoder
 from velap.models.checkpoint import load_checkpoint, released_checkpoint
+from velap.report.diagnose.model import load_as_trained
 from velap.report.figures import (
     PROBES,
     draw_path,
@@ -53,18 +52,17 @@ if TYPE_CHECKING:
 PAPER_TASKS = ("SpiralMaze", "ObstacleMaze")
 """Rows of the paper's figure."""
 LAYOUTS = {"ObstacleMaze": (1, 2)}
-"""Test contexts that get a row each. ours: the first two with the way open on opposite sides."""
+"""Test contexts with a row each. ours: the first two whose ways are open on opposite sides."""
 OWN_DATA, SHIPPED_DATA = Path("runs/figures"), Path("results/figures")
-"""Where the data of a user's own figures go, and those of the published one."""
+"""Folders for the data of users' figures and of the published one."""
 FIRST_SEED = 1000
 """Seed of the first test start that is planned from. ours: validation seeds."""
 PATHS = 3
-"""Planned paths R, each from a start of its own. ours."""
+"""R, planned paths from different starts. ours."""
 LANDMARKS = 9
-"""States that are numbered in panels a to c and shown in panel e. ours: colours alone do not survive a grey print."""
+"""States that are numbered in panels a to d and shown in panel e. ours: numbers survive a grey print."""
 CORNERS = np.array([[(8, 48, 107), (127, 39, 4)], [(158, 202, 225), (253, 190, 133)]]) / 255
-"""Colours of the corners of the positions [bottom or top, left or right]. ours: blue to orange, which colour-blind eyes tell
-apart, dark to light."""
+"""Colours of the corners [bottom or top, left or right]. ours: blue to orange, dark to light, for colour-blind readers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,17 +75,17 @@ class LatentSpace:
     values: NDArray[np.float32]
     """[P] Q^g [Q-value]."""
     positions: NDArray[np.float32]
-    """[P, 2] [m]; [0, 2] where they are not known."""
+    """[P, 2] [m]; [0, 2] if unknown."""
     times: NDArray[np.int32]
-    """[P] time of each state in its episode [steps]; [0] where positions are known."""
+    """[P] time of each state in its episode [steps]; [0] if positions are known."""
     landmarks: NDArray[np.int64]
-    """[C] states that are numbered, that of the lowest Q^g first."""
+    """[C] numbered states, in the order of increasing Q^g."""
     frames: NDArray[np.uint8]
     """[C, S, S, 3] their newest frames."""
     background: NDArray[np.uint8]
-    """[S, S, 3] the scene without the robot; [0, 0, 3] where positions are not known."""
+    """[S, S, 3] the scene without the robot; [0, 0, 3] if positions are unknown."""
     extent: NDArray[np.float64]
-    """Left, right, bottom, top of the frame [m]; [0] where positions are not known."""
+    """Left, right, bottom, top of the frame [m]; [0] if positions are unknown."""
     paths: NDArray[np.float32]
     """[R, L, 2] planned paths in the Isomap, NaN behind their ends."""
     tree: NDArray[np.float32]
@@ -97,8 +95,7 @@ class LatentSpace:
 
 
 def of_env(player: Player, title: str, options: dict[str, Any] | None = None, count: int = PROBES) -> LatentSpace:
-    """`count` states at uniform positions of one scene, and plans from its test starts. `options` of the environment's reset
-    choose the scene."""
+    """`count` states at uniform positions of a scene, and plans from test starts; `options` of `reset` choose the scene."""
     model, stack = player.model, player.config.model.frame_stack
     assert model is not None
     env = player.make_env()
@@ -119,7 +116,7 @@ def of_env(player: Player, title: str, options: dict[str, Any] | None = None, co
 
 
 def of_data(model: LatentModel, config: Config, title: str, store: FrameStore, count: int = PROBES) -> LatentSpace:
-    """`count` states of a dataset, and plans from the first states of some episodes; nothing is known of positions."""
+    """`count` states of a dataset, and plans from the first states of some episodes; positions are unknown."""
     if store.n_episodes < PATHS:
         raise DatasetError(f"{store.dataset_id} has {store.n_episodes} episodes; expected {PATHS} at least, one a planned "
                            "path. Take a larger dataset.")
@@ -139,7 +136,7 @@ def of_data(model: LatentModel, config: Config, title: str, store: FrameStore, c
 
 def _space(model: LatentModel, config: Config, title: str, latents: NDArray[np.float32], values: NDArray[np.float32],
            roots: torch.Tensor, frames: NDArray[np.uint8], **world: NDArray[Any]) -> LatentSpace:
-    """Plan from the roots [R, D], and put states, trees and paths into one plane."""
+    """Plan from the roots [R, D], and embed states, tree and paths in one plane."""
     generators = [torch.Generator().manual_seed(FIRST_SEED + row) for row in range(len(roots))]
     with torch.inference_mode():
         found = search_of(model, config)(roots, generators)
@@ -156,7 +153,7 @@ def _space(model: LatentModel, config: Config, title: str, latents: NDArray[np.f
 
 
 def spread(places: NDArray[np.floating[Any]], count: int) -> NDArray[np.int64]:
-    """Up to `count` of places [P, 2], each the farthest from those before it."""
+    """Numbers of up to `count` of the places [P, 2], each the farthest from those before it."""
     chosen = [int(((places - places.mean(0)) ** 2).sum(-1).argmax())]
     nearest = np.full(len(places), np.inf)
     while len(chosen) < min(count, len(places)):
@@ -166,7 +163,7 @@ def spread(places: NDArray[np.floating[Any]], count: int) -> NDArray[np.int64]:
 
 
 def save(path: Path, rows: Sequence[LatentSpace]) -> None:
-    """All that the rows of one task show in an npz file."""
+    """Write the rows of one task into an npz file."""
     arrays = {f"{number}_{field.name}": np.asarray(getattr(row, field.name))
               for number, row in enumerate(rows) for field in fields(LatentSpace)}
     content = io.BytesIO()
@@ -175,7 +172,7 @@ def save(path: Path, rows: Sequence[LatentSpace]) -> None:
 
 
 def load(path: Path) -> list[LatentSpace]:
-    """What `save` wrote."""
+    """Rows from a file of `save`."""
     if not path.is_file():
         raise DatasetError(f"no data of the figure at {path}; expected a file that `velap figure 3` writes. Leave --no-run "
                            "out to make it.")
@@ -281,7 +278,7 @@ def _draw_frames(axes: Any, frames: NDArray[np.uint8]) -> None:
 
 def spaces_of(task: str, checkpoint: Path | None, dataset: str | None, image_key: str | None, device: str,
               ) -> list[LatentSpace]:
-    """The rows of a task: its scenes where the robot can be put anywhere, else states of the dataset."""
+    """The rows of a task: its scenes if the robot can be placed anywhere, else states of the dataset."""
     path = checkpoint or released_checkpoint(task)
     if dataset is None and task in TASKS and isinstance(make_env(TASKS[task].env_id).unwrapped, Mapped):
         player = load_player(Evaluation(task, checkpoint=path, image_key=image_key, device=device))
@@ -291,16 +288,13 @@ def spaces_of(task: str, checkpoint: Path | None, dataset: str | None, image_key
         return [of_env(player, f"{task}, layout {number}", {"split": "test", "context": context})
                 for number, context in enumerate(layouts, start=1)]
     model, config, metadata = load_checkpoint(path, pick_device(device))
-    reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else Reading()
     source = dataset or (TASKS[task].dataset_id if task in TASKS else task)
-    store = load_store(source, image_key or reading.image_key or None, image_size=model.spaces.height, fit=reading.fit,
-                       success=reading.success or None)
-    return [of_data(model, config, task, store)]
+    return [of_data(model, config, task, load_as_trained(source, image_key, model, metadata))]
 
 
 def show(console: Console, task: str | None, *, checkpoint: Path | None = None, dataset: str | None = None,
          image_key: str | None = None, device: str = "auto", no_run: bool = False, write: Path | None = None) -> None:
-    """Find out what the figure shows, keep that in a file a task, and draw the files as PNG and PDF; `no_run` only draws."""
+    """Compute the data of the figure, one file a task, and draw them as PNG and PDF; `no_run` only draws."""
     own = checkpoint is not None or dataset is not None
     tasks = PAPER_TASKS if task is None else (task,)
     data = OWN_DATA if own else SHIPPED_DATA

@@ -1,4 +1,4 @@
-"""Videos of rollouts: every environment a tile, with the waypoints that its agent follows drawn where they are in the world.
+"""Videos of rollouts: one tile an environment, with the waypoints of its agent drawn at their positions in the world.
 
 S side of a tile [px], B environments.
 """
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from velap.methods.tree_agent import FOLLOWING, IN_WORDS, TreeAgent
-from velap.report.figures import LatentMap, can_probe, probe, to_pixels
+from velap.report.figures import PROBES, LatentMap, can_probe, probe, to_pixels
 from velap.runs import storage_errors
 
 if TYPE_CHECKING:
@@ -34,12 +34,12 @@ CAPTION = 32
 FPS = 20
 """Frames a second: environment steps of 0.05 s in real time."""
 HOLD = 20
-"""Frames that the last picture stays."""
+"""Number of times that the last picture is repeated."""
 _WAYPOINT, _NEXT, _SOLVED, _FAILED = (255, 140, 0), (255, 40, 40), (20, 140, 60), (170, 30, 30)
 
 
 class VideoRecorder:
-    """An observer that writes an mp4 with B tiles while the episodes run; the file appears when it is whole."""
+    """An observer that writes an mp4 with B tiles while the episodes run; the file appears when it is complete."""
 
     def __init__(self, path: Path, tiles: int, latent_map: LatentMap | None = None) -> None:
         self.path = path
@@ -64,7 +64,7 @@ class VideoRecorder:
         return self
 
     def __call__(self, moment: Moment) -> None:
-        """Draw the tile of a row; a frame is written whenever the rows come round again."""
+        """Draw the tile of a row; each round over the rows writes a frame."""
         row, outcome = moment.row, moment.outcome
         if row <= self._last_row and outcome is None:
             self._write()
@@ -86,7 +86,7 @@ class VideoRecorder:
         self._canvas[y + TILE : y + TILE + CAPTION, x : x + TILE] = np.asarray(caption)
 
     def _draw_plan(self, image: Image.Image, agent: TreeAgent, row: int) -> str:
-        """Draw the waypoints ahead of `row`, the next one in red; returns what the agent does, for the caption."""
+        """Draw the waypoints ahead of `row`, the next one in red; returns the caption."""
         value = agent.last_values[row]
         waypoints = agent.plans.ahead(row).float().cpu().numpy()
         actor = agent.last_actors[row]
@@ -117,8 +117,8 @@ class VideoRecorder:
 
 
 def picture(moment: Moment, size: int) -> NDArray[np.uint8]:
-    """What the environment looks like, uint8 [size, size, 3]: drawn at that size where it can; what the agent sees where it
-    draws nothing."""
+    """A picture of the environment, uint8 [size, size, 3], rendered at that size if possible, else enlarged; the agent's
+    frame if the environment renders nothing."""
     env = moment.env
     if can_probe(env):
         return env.unwrapped.render(size)
@@ -127,15 +127,14 @@ def picture(moment: Moment, size: int) -> NDArray[np.uint8]:
     return np.asarray(image.resize((size, size), Image.Resampling.NEAREST))
 
 
-def latent_map_of(player: Player) -> LatentMap | None:
-    """The latent map of a player's model in its environment; None where the environment cannot be probed."""
+def latent_map_of(player: Player, seed: int = 0, count: int = PROBES) -> LatentMap | None:
+    """Real states of the scene of that seed, by the player's model; None if the environment cannot be probed."""
     env = player.make_env()
     try:
         if player.model is None or not can_probe(env):
             return None
-        reader = player.frames_of(env)
-        return probe(player.model, env, reader, frame_stack=player.config.model.frame_stack,
-                     rng=np.random.default_rng(0))
+        return probe(player.model, env, player.frames_of(env), frame_stack=player.agent.frame_stack,
+                     rng=np.random.default_rng(0), count=count, seed=seed)
     finally:
         env.close()
 
@@ -143,5 +142,5 @@ def latent_map_of(player: Player) -> LatentMap | None:
 def film(player: Player, seeds: Sequence[int], path: Path) -> None:
     """Run the episodes of `seeds` again, all at once, and film them."""
     with VideoRecorder(path, len(seeds), latent_map_of(player)) as recorder:
-        for _ in player.rollout(len(seeds), recorder).run(seeds):
+        for _ in player.episodes(seeds, len(seeds), recorder):
             pass

@@ -1,4 +1,4 @@
-"""`velap view`: what an agent did in an episode, step by step, and real states to compare its latents with.
+"""`velap view`: the decisions of an agent in one episode, and real states to compare its latents with.
 
 T steps of an episode, D latent dimensions.
 """
@@ -21,27 +21,25 @@ from velap.evaluation.rollout import Episode, Moment
 from velap.methods.tree_agent import FOLLOWING, Actor, TreeAgent
 from velap.models.checkpoint import load_checkpoint, released_checkpoint
 from velap.report.diagnose.model import open_recorded, real_states_of
-from velap.report.figures import Planned, RealStates, can_probe, planned, probe
-from velap.report.video import picture
+from velap.report.figures import PROBES, Planned, RealStates, planned
+from velap.report.video import latent_map_of, picture
 from velap.search.types import Plan
 from velap.tasks import TASKS
 
 FIRST_SEED = 1000
-"""Episode that is shown unless said: the first validation seed."""
+"""Default episode: the first validation seed."""
 SIDE = 256
 """Side of the pictures of the world [px]."""
-STATES = 1200
-"""Real states in the map at most. ours: enough to see a maze's corridors, and some seconds of Isomap."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MadePlan(Planned):
-    """A plan, and when it was made."""
+    """A plan, and when and how it was made."""
 
     step: int
     """Step that it was made at."""
     reached_goal: bool | None
-    """Some node has Q^g > τ_goal; None where the planner does not tell."""
+    """Some node has Q^g > τ_goal; None for planners without a tree."""
     cost: float | None
     """c(g*) [steps]."""
     milliseconds: float
@@ -54,20 +52,20 @@ class Step:
     picture: NDArray[np.uint8]
     """[SIDE, SIDE, 3] the world before the action."""
     latent: NDArray[np.float32] | None
-    """[D]; None for methods that do not tell."""
+    """[D]; None for methods other than VELAP."""
     value: float | None
     """Q^g [Q-value]."""
     actor: Actor | None
-    """Who acts; None for methods that do not tell."""
+    """Who acts; None for methods other than VELAP."""
     waypoint: int | None
-    """Number of the waypoint headed for, from 1 on; None where no plan is followed."""
+    """Number of the current waypoint, from 1; None without a plan to follow."""
     plan: int | None
-    """Number of the plan held."""
+    """Number of the current plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """An episode as it was seen."""
+    """One episode."""
 
     outcome: Episode
     steps: tuple[Step, ...]
@@ -77,7 +75,7 @@ class Trace:
 
 
 class Tracer:
-    """An observer of one episode at a time, in one row, that keeps what the agent tells."""
+    """An observer that keeps the decisions of one episode at a time, in one row."""
 
     def __init__(self) -> None:
         self._steps: list[Step] = []
@@ -86,7 +84,7 @@ class Tracer:
         """Finished episodes."""
 
     def __call__(self, moment: Moment) -> None:
-        """Keep a step, or close the episode."""
+        """Keep a step, or finish the episode."""
         seen = picture(moment, SIDE)
         if moment.outcome is not None:
             self.traces.append(Trace(outcome=moment.outcome, steps=tuple(self._steps), last_picture=seen,
@@ -117,33 +115,27 @@ def _made(agent: TreeAgent, row: int, step: int) -> MadePlan:
 
 
 def trace(player: Player, seed: int) -> Trace:
-    """Run the episode of `seed` and keep it."""
+    """Run the episode of `seed`."""
     tracer = Tracer()
-    for _ in player.rollout(1, tracer).run([seed]):
+    for _ in player.episodes([seed], 1, tracer):
         pass
     return tracer.traces[0]
 
 
-def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: int = STATES) -> RealStates | None:
-    """Real states: of the dataset where one is named; else of the episode's own scene, where the environment can be put
-    anywhere; else of the task's dataset, where it is here; else the bank of latents in the checkpoint, without frames."""
+def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: int = PROBES) -> RealStates | None:
+    """Real states of the given dataset; else of the episode's own scene if the robot can be placed anywhere; else of the
+    task's dataset if it exists; else the checkpoint's bank of latents, without frames."""
     if player.model is None:
         return None
-    rng = np.random.default_rng(0)
     if dataset is None:
-        env = player.make_env()
-        try:
-            if can_probe(env):
-                return probe(player.model, env, player.frames_of(env), frame_stack=player.config.model.frame_stack, rng=rng,
-                             count=count, seed=seed)
-        finally:
-            env.close()
+        if (found := latent_map_of(player, seed, count)) is not None:
+            return found
         own = TASKS[player.key.task].dataset_id if player.key.task in TASKS else None
         dataset = own if own is not None and minari_io.exists(own) else None
     if dataset is not None:
         metadata = {"seed": str(player.key.train_seed), "reading": player.reading.to_json()}
         recorded = open_recorded(dataset, player.key.image_key, player.model, player.config, metadata)
-        return real_states_of(player.model, recorded, rng, count)
+        return real_states_of(player.model, recorded, np.random.default_rng(0), count)
     bank = getattr(player.model, "bank_latents", torch.empty(0))
     if len(bank) == 0:
         return None
@@ -153,21 +145,20 @@ def backdrop_of(player: Player, seed: int, dataset: str | None = None, count: in
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """What is to be viewed."""
+    """An episode to view."""
 
     player: Player
     seed: int
     records: tuple[Record, ...] = ()
-    """Of the file that was named."""
+    """All records of the given file."""
 
 
 def subject_of(source: Path, *, episode_seed: int | None = None, checkpoint: Path | None = None, method: str = "velap",
                env: str | None = None, env_kwargs: dict[str, Any] | None = None, max_steps: int | None = None,
                device: str = "auto") -> Subject:
-    """A checkpoint, or a record file: then an episode of it is run again as it was recorded.
+    """An episode of a checkpoint, or a recorded one that runs again as it was recorded.
 
-    Of a record file the first failed episode is taken unless one is named, and the checkpoint is the task's released one
-    unless one is named.
+    Defaults for a record file: the first failed episode, and the task's released checkpoint.
     """
     if source.suffix != ".jsonl":
         task = load_checkpoint(source)[1].task
@@ -187,7 +178,7 @@ def subject_of(source: Path, *, episode_seed: int | None = None, checkpoint: Pat
 
 
 def _recorded_player(source: Path, key: Record, checkpoint: Path | None, device: str) -> Player:
-    """The player that a record file comes from; raises ConfigError where the checkpoint is another one."""
+    """The player that made a record file; raises ConfigError for another checkpoint."""
     if checkpoint is None and key.checkpoint:
         try:
             checkpoint = released_checkpoint(key.task)

@@ -1,4 +1,4 @@
-"""The page of `velap view`: one HTML file with everything in it, which asks the network for nothing.
+"""The page of `velap view`: one self-contained HTML file that makes no network request.
 
 P states of a backdrop, D latent dimensions, M nodes of a tree, L waypoints, T steps.
 """
@@ -28,19 +28,19 @@ from velap.search.types import SearchFns
 Projection = Literal["isomap", "pca"]
 TEMPLATE, MARK = "viewer.html", "{{DATA}}"
 LARGEST = 10_000_000
-"""Size of a page at most [bytes]."""
+"""Largest size of a page [bytes]."""
 SIDES = (SIDE, 128, 64)
-"""Sides of the pictures that are tried until the page is small enough [px]."""
+"""Sides of the pictures, tried in turn until the page is small enough [px]."""
 QUALITY = 80
-"""Of WebP pictures of the world."""
+"""WebP quality of pictures of the world."""
 GRID = 1000
-"""Coordinates of the latent map go from 0 to this."""
+"""Largest coordinate of the latent map."""
 DIGITS = 4
-"""Of values [Q-value]."""
+"""Decimal places of Q-values."""
 
 
 def page(subject: Subject, trace: Trace, backdrop: RealStates | None, projection: Projection = "isomap") -> str:
-    """The HTML text; raises ConfigError where the episode is too long for a page of LARGEST bytes."""
+    """The HTML text; raises ConfigError for an episode that does not fit into LARGEST bytes."""
     template = files("velap.report").joinpath(TEMPLATE).read_text(encoding="utf-8")
     data = episode_data(subject, trace, backdrop, projection)
     for side in SIDES:
@@ -53,7 +53,7 @@ def page(subject: Subject, trace: Trace, backdrop: RealStates | None, projection
 
 
 def episode_data(subject: Subject, trace: Trace, backdrop: RealStates | None, projection: Projection) -> dict[str, Any]:
-    """What the page shows, but the pictures of the world."""
+    """All data of the page except the pictures of the world."""
     player, outcome = subject.player, trace.outcome
     config, key = player.config, player.key
     trail = [step.latent for step in trace.steps if step.latent is not None]
@@ -116,7 +116,7 @@ def _values(subject: Subject, latents: NDArray[np.float32]) -> list[float]:
 
 
 def _tiles(plans: Sequence[MadePlan], backdrop: RealStates | None) -> dict[int, str]:
-    """Frames of the backdrop that some film strip shows, as data URIs by number."""
+    """Frames of the backdrop that appear in film strips, as data URIs by number."""
     if backdrop is None or not len(backdrop.frames):
         return {}
     shown = {int(number) for plan in plans for number in backdrop.nearest(plan.waypoints)[0]}

@@ -170,7 +170,7 @@ class BlockMaze(PixelTask):
         return self.layout.geodesic(positions) / STEP_LENGTH
 
     def expert_action(self) -> NDArray[np.float32]:
-        """The action [2] that follows the shortest way; for tests and benchmarks only, no training data come from it."""
+        """The action [2] that follows the shortest way; no training data come from it."""
         return follow_shortest_path(self.layout, self.agent_position(), STEP_LENGTH)
 
 

@@ -164,7 +164,7 @@ class Layout:
         return np.minimum(direct, around), np.where(direct <= around, -1, corner)
 
     def geodesic(self, points: Points) -> NDArray[np.float64]:
-        """points[*, 2] [m] -> shortest path of the block's centre to the goal region [*] [m]; inf where there is none."""
+        """points[*, 2] [m] -> shortest path of the block's centre to the goal region [*] [m]; inf without one."""
         points = np.asarray(points, dtype=np.float64)
         return self._first_leg(points.reshape(-1, 2))[0].reshape(points.shape[:-1])
 

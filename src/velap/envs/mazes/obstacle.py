@@ -36,11 +36,11 @@ _ORDER = np.random.default_rng(0).permutation(CONTEXTS)
 """Contexts in random order, the same one always: the first are those of the training data."""
 
 _GOAL = (27, 57, 37, FRAME)
-"""The red piece of the upper wall and of the floor in front of it [px]. Random walks of 20 steps get so far that a wall red
-from end to end would be reached in 0.9 % of the transitions, however thin the strip in front of it; it is to be 0.11 %."""
+"""The red piece of the upper wall and of the floor in front of it [px]. A wall that is red from end to end would be reached
+in 0.9 % of the transitions of the random walks, however thin the strip in front of it; Table 10 has 0.11 %."""
 _POST = (2, 5)
-"""Thickness of the posts on both sides of the red piece, and how far they stand out of the wall [px]: nobody slides into the
-goal along the wall. Between them the block has 5.5 px of freedom, as in SpiralMaze's corridor."""
+"""Thickness of the posts on both sides of the red piece, and how far they stand out of the wall [px]: they keep the block
+from sliding into the goal along the wall. Between them the block has 5.5 px of freedom, as in SpiralMaze's corridor."""
 _TEST_STARTS = (5.5, 5.5, 58.5, 9.5)
 """Block centres [px], along the whole lower wall."""
 

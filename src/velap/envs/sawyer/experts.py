@@ -1,8 +1,8 @@
 """Scripted experts of the manipulation tasks: they read positions of objects, which the agents have to see.
 
-Each is a function of the present state alone, so that it goes on from wherever random actions have brought the hand. The
-gripper is a pair of fingers at ±5 cm along y, 3 cm wide along x, from 5 cm below the hand to the gripper's base above it.
-All positions are [3] [m] in world axes: x right, y away from the arm's base, z up.
+Each is a function of the current state alone, so that it continues from anywhere. The gripper is a pair of fingers at ±5 cm
+along y, 3 cm wide along x, from 5 cm below the hand to the gripper's base above it. All positions are [3] [m] in world axes:
+x right, y away from the arm's base, z up.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ class SawyerTask(PixelTask):
 
     def true_state(self) -> NDArray[np.float32]:
         """What a frame shows, in numbers: hand [3] [m], joints of the objects [m or rad], x and y of placed bodies [m], and
-        how far the fingers are open [m]. For rulers and tests; agents never see it."""
+        how far the fingers are open [m]. For studies and tests; agents never see it."""
         joints = [float(self.data.joint(name).qpos[0]) for name in self.joints]
         places = [value for name in self.placed for value in self.model.body(name).pos[:2]]
         return np.array([*self.agent_position(), *joints, *places, self.data.joint("r_close").qpos[0]], np.float32)

@@ -124,7 +124,7 @@ class SawyerScene:
     """Draws states of one task's Meta-World model; one thread at a time. Models that differ in poses only may share it."""
 
     def __init__(self, drawing: Drawing, model: Any, view: View = VIEW) -> None:
-        """Bodies right below the world may be moved between frames (`model.body_pos`), but for the table, wall and base."""
+        """Bodies right below the world, except table, wall and base, may be moved between frames (`model.body_pos`)."""
         self.view = view
         names = {part.body for part in drawing.parts} - {""}
         self._bodies: NDArray[np.int64] = np.array(sorted(model.body(name).id for name in names), dtype=np.int64)

@@ -1,7 +1,6 @@
 """The four manipulation tasks (App. C.2): what stands where, where episodes start, when they succeed.
 
-The paper gives no lengths: all numbers here are ours, but for what Meta-World's scenes and success rules fix. All are in
-metres.
+The paper gives no lengths: all numbers here are ours [m], except those that Meta-World's scenes and success rules fix.
 """
 
 from __future__ import annotations
@@ -92,9 +91,7 @@ class WindowClose(_NearOrAnywhere):
         """Is the sash at most 4 cm from shut? Meta-World's rule."""
         return bool(abs(self.data.site("handleCloseStart").xpos[0] - self.model.body("window").pos[0]) <= 0.05)
 
-    def expert_action(self) -> NDArray[np.float32]:
-        """To the right of the handle, then to the left with it."""
-        return experts.close_window(self)
+    expert_action = experts.close_window
 
 
 class FaucetClose(_NearOrAnywhere):
@@ -139,12 +136,22 @@ class FaucetClose(_NearOrAnywhere):
         tip = self.data.site("handleStartClose").xpos + np.array([0.0, 0.0, -0.01])
         return bool(np.linalg.norm(tip - target) <= 0.07)
 
-    def expert_action(self) -> NDArray[np.float32]:
-        """Over the handle to its right, then round to the left with it."""
-        return experts.close_faucet(self)
+    expert_action = experts.close_faucet
 
 
-class ButtonWall(SawyerTask):
+class _WithButton(SawyerTask):
+    """Has a button to press."""
+
+    def button(self) -> Vector:
+        """The middle of the button's face [3] [m]."""
+        return self.data.body("button").xpos + np.array([0.0, -0.194, 0.0])
+
+    def button_pressed(self) -> bool:
+        """Is the button in?"""
+        return bool(self.data.joint("btnbox_joint").qpos[0] <= -PRESSED)
+
+
+class ButtonWall(_WithButton):
     """Go round a wall and press the button behind it; the hand may not rise above the wall (C.2.3)."""
 
     assets: ClassVar[str] = "button-wall"
@@ -198,10 +205,6 @@ class ButtonWall(SawyerTask):
         """The middle of the wall's foot [3] [m]."""
         return self.model.body("wall").pos.copy()
 
-    def button(self) -> Vector:
-        """The middle of the button's face [3] [m]."""
-        return self.data.body("button").xpos + np.array([0.0, -0.194, 0.0])
-
     def objects(self) -> NDArray[np.float64]:
         """The button [1, 3] [m]."""
         return self.button()[None]
@@ -225,7 +228,7 @@ class ButtonWall(SawyerTask):
 
     def succeeded(self) -> bool:
         """Is the button in?"""
-        return bool(self.data.joint("btnbox_joint").qpos[0] <= -PRESSED)
+        return self.button_pressed()
 
     def expert_distance(self) -> float:
         """From the hand to the button on the button's side of the wall [m]; infinite on the other."""
@@ -233,12 +236,10 @@ class ButtonWall(SawyerTask):
         past = hand[1] > self.model.body("wall").pos[1] + self.wall_half_depth
         return float(np.linalg.norm(hand - self.button())) if past else float("inf")
 
-    def expert_action(self) -> NDArray[np.float32]:
-        """Round the wall's nearer end, then straight on."""
-        return experts.press_behind_wall(self)
+    expert_action = experts.press_behind_wall
 
 
-class DrawerButton(_NearOrAnywhere):
+class DrawerButton(_WithButton, _NearOrAnywhere):
     """Close the drawer, then press the button beside it (C.2.4). Done while the drawer is closed and the button pressed.
 
     Data hold either subtask alone: an open drawer to close, or a closed one and the button to press. Tests start with both
@@ -289,17 +290,9 @@ class DrawerButton(_NearOrAnywhere):
         """The middle of the drawer's handle [3] [m]."""
         return self.data.body("drawer_link").xpos + np.array([0.0, -0.15, 0.0])
 
-    def button(self) -> Vector:
-        """The middle of the button's face [3] [m]."""
-        return self.data.body("button").xpos + np.array([0.0, -0.194, 0.0])
-
     def drawer_closed(self) -> bool:
         """Is the drawer open by at most `CLOSED`?"""
         return bool(self.data.joint("goal_slidey").qpos[0] >= -CLOSED)
-
-    def button_pressed(self) -> bool:
-        """Is the button in?"""
-        return bool(self.data.joint("btnbox_joint").qpos[0] <= -PRESSED)
 
     def subtasks(self) -> tuple[bool, bool]:
         """What is done now, in the order that it has to be done: drawer closed, button pressed."""
@@ -326,6 +319,4 @@ class DrawerButton(_NearOrAnywhere):
         finished = self._subtask == "drawer" and self.drawer_closed()
         return float("inf") if finished else super().expert_distance()
 
-    def expert_action(self) -> NDArray[np.float32]:
-        """The drawer first, then the button."""
-        return experts.close_then_press(self)
+    expert_action = experts.close_then_press

@@ -1,6 +1,6 @@
 """Scripted experts of the two tasks: they read positions of objects, which the agents have to see.
 
-Each is a function of the present state alone. All positions are in world axes [m], rotations about the vertical [rad].
+Each is a function of the current state alone. All positions are in world axes [m], rotations about the vertical [rad].
 """
 
 from __future__ import annotations

@@ -201,6 +201,4 @@ class Rope(WidowXTask):
         straight = np.hypot(*(self.agent_position() - self.region())[:2])
         return float(max(straight, 0.1 * abs(missing)))
 
-    def expert_action(self) -> NDArray[np.float32]:
-        """Round the pole, then to the region."""
-        return experts.unwind_rope(self)
+    expert_action = experts.unwind_rope

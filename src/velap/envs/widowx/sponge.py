@@ -111,6 +111,4 @@ class Sponge(WidowXTask):
         """From the sponge to the middle of the region [m]."""
         return float(np.linalg.norm(self.sponge()[:2] - REGION))
 
-    def expert_action(self) -> NDArray[np.float32]:
-        """Behind the sponge, then push."""
-        return experts.push_sponge(self)
+    expert_action = experts.push_sponge

@@ -1,4 +1,4 @@
-"""`velap diagnose`: what a model has learnt and where its episodes fail, in pictures and a page of text."""
+"""`velap diagnose`: measures what a model has learnt and where its episodes fail, and writes pictures and a page."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ STARTS = 5
 SCENES = 3
 """Scenes and expert's episodes. ours."""
 LONGEST = 20
-"""Longest rollout that is followed [steps]. ours."""
+"""Longest rollout [steps]. ours."""
 PAGE = "report.md"
 
 
@@ -90,12 +90,12 @@ class Diagnosis:
     subject: str
     command: str
     origin: str
-    """Sentences about what was looked at."""
+    """Which checkpoint, dataset and episodes were examined."""
     left_out: tuple[str, ...]
     discount: float
     """γ."""
     arrived_steps: float
-    """Q^l's steps that count as arrived, `controller.waypoint_exponent` [steps]."""
+    """A state at most this far by Q^l counts as arrived, `controller.waypoint_exponent` [steps]."""
     simulated: int
     """Simulated steps of an expansion, `planner.n_sim` [steps]."""
     rollout: RolloutError
@@ -108,7 +108,7 @@ class Diagnosis:
 
 
 class _Subject(NamedTuple):
-    """What a request means."""
+    """What a request refers to."""
 
     name: str
     checkpoint: Path
@@ -118,7 +118,7 @@ class _Subject(NamedTuple):
 
 
 def resolve(request: Request) -> _Subject:
-    """Find checkpoint, dataset and environment; raises what says how to get them."""
+    """Find checkpoint, dataset and environment; raises an error that says how to get a missing one."""
     task, env = request.task, request.env
     if task is None:
         if request.dataset is None:
@@ -159,7 +159,7 @@ def _check_seeds(request: Request, ours: bool) -> None:
 
 
 def run_diagnose(console: Console, request: Request) -> Diagnosis:
-    """Measure, draw and write; prints what was found and where it lies."""
+    """Measure, draw and write; prints the checks and the path of the report."""
     began = time.monotonic()
     subject = resolve(request)
     model, config, metadata = load_checkpoint(subject.checkpoint, pick_device(request.device))
@@ -217,7 +217,7 @@ def _measure(console: Console, request: Request, subject: _Subject, model: Laten
 
 
 class _World(NamedTuple):
-    """What an environment shows."""
+    """Measured in an environment."""
 
     starts: Starts | None = None
     curves: tuple[ValueCurve, ...] = ()
@@ -226,7 +226,7 @@ class _World(NamedTuple):
 
 
 def _look_at_world(console: Console, request: Request, model: LatentModel, player: Player) -> _World:
-    """Starts, expert's episodes and scenes of the seeds from the first on."""
+    """Starts, expert's episodes and scenes of the first seeds."""
     env: gym.Env[Any, Any] = player.make_env()
     seeds, frame_stack = range(request.first_seed, request.first_seed + STARTS), player.config.model.frame_stack
     try:
@@ -245,18 +245,18 @@ def _look_at_world(console: Console, request: Request, model: LatentModel, playe
 
 
 def _recorded_starts(recorded: Recorded) -> Starts:
-    """First states of the episodes that are looked at."""
+    """First states of the examined episodes."""
     picked = recorded.episodes[:STARTS]
     rows = recorded.sampler.starts.new_tensor(recorded.store.episode_start[picked])
     return Starts(tuple(f"episode {episode} of the data" for episode in picked), recorded.sampler.stacks(rows).cpu().numpy())
 
 
 def _origin(subject: _Subject, recorded: Recorded, config: Config) -> str:
-    """What was looked at."""
+    """Which checkpoint, dataset and episodes were examined."""
     kind = "were not trained on" if recorded.held_out else "were trained on: the dataset is too small to keep any out"
     return (f"Checkpoint `{subject.checkpoint.name}` (task {config.task}, preset {config.preset}), dataset "
-            f"{subject.dataset_id} with {recorded.store.n_episodes} episodes; the {len(recorded.episodes)} that are looked "
-            f"at {kind}.")
+            f"{subject.dataset_id} with {recorded.store.n_episodes} episodes; the {len(recorded.episodes)} examined "
+            f"ones {kind}.")
 
 
 def _left_out(world: _World, player: Player | None) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap.envs.protocol import Measured, Positioned, WithObjects, WithSubtasks
-from velap.evaluation.evaluate import BATCH, Player
+from velap.evaluation.evaluate import Player
 from velap.evaluation.rollout import Moment
 from velap.methods.tree_agent import TreeAgent
 from velap.report.figures import FilmStrip
@@ -35,7 +35,7 @@ CLASSES = {
     "failed near the goal": "Q^g rose above τ_stop, π^g took over, and no success: π^g fails, or Q^g errs about being near",
     "stopped halfway": "none of these: the waypoints led elsewhere, or could not be followed",
 }
-"""What each class of episodes is; the first that holds counts."""
+"""Classes of episodes; an episode belongs to the first that holds."""
 REMEDIES = {
     "never left the start": "π^l does not carry out the first waypoint, or the tree is stuck: see the trees' rejections and "
                             "the rollout error",
@@ -51,23 +51,23 @@ REMEDIES = {
 
 @dataclass
 class Trace:
-    """What was seen of one episode, state by state."""
+    """One episode, state by state."""
 
     seed: int
     positions: list[NDArray[np.float64]] = field(default_factory=list)
-    """[T, P] agent [m]; empty where the environment does not tell."""
+    """[T, P] agent [m]; empty if unknown."""
     objects: list[NDArray[np.float64]] = field(default_factory=list)
-    """[T, K, 3] [m]; empty where there are none."""
+    """[T, K, 3] [m]; empty without objects."""
     subtasks: list[tuple[bool, ...]] = field(default_factory=list)
-    """[T] which are done, in their order; empty where there are none."""
+    """[T] which are done, in their order; empty without subtasks."""
     values: list[float] = field(default_factory=list)
     """[T - 1] Q^g before each action [Q-value]."""
     near_goal: list[bool] = field(default_factory=list)
     """[T - 1] π^g led because Q^g was above τ_stop."""
     goal_steps: list[float] = field(default_factory=list)
-    """[T] shortest way to the goal [steps]; empty where the environment does not tell."""
+    """[T] shortest way to the goal [steps]; empty if unknown."""
     shots: list[tuple[int, NDArray[np.uint8]]] = field(default_factory=list)
-    """Some steps [steps] and their frames."""
+    """Some time steps and their frames."""
     success: bool = False
     steps: int = 0
     """[steps]"""
@@ -75,7 +75,7 @@ class Trace:
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedEpisode:
-    """One episode, judged."""
+    """One episode and its class."""
 
     seed: int
     kind: str
@@ -85,11 +85,11 @@ class JudgedEpisode:
     farthest: float | None
     """Largest distance from the start [m]."""
     best_value: float
-    """Highest Q^g that was met [Q-value]."""
+    """Highest Q^g of the episode [Q-value]."""
     by_global: float
     """Share of the steps that π^g led near the goal."""
     goal_steps: float | None
-    """Least shortest way to the goal that was met [steps]."""
+    """Smallest distance to the goal [steps]."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Failures:
 
     outcomes: tuple[JudgedEpisode, ...]
     strip: FilmStrip
-    """One episode that failed, or the longest where none did."""
+    """A failed episode, or the longest one if none failed."""
 
     @property
     def counts(self) -> dict[str, int]:
@@ -107,7 +107,7 @@ class Failures:
 
 
 def classify(trace: Trace, fastest: float) -> str:
-    """The class of an episode; `fastest` is the longest step that is known [m/step]."""
+    """The class of an episode; `fastest` is the longest known step [m/step]."""
     if trace.success:
         return "solved"
     if trace.positions and _farthest(trace) <= LEFT_START * fastest:
@@ -126,20 +126,20 @@ def _farthest(trace: Trace) -> float:
 
 
 def _moved(objects: Sequence[NDArray[np.float64]]) -> float:
-    """How far any object got from its first place [m]."""
+    """Largest displacement of any object [m]."""
     places = np.stack(objects)
     return float(np.linalg.norm(places - places[0], axis=-1).max())
 
 
 def fastest_step(traces: Sequence[Trace]) -> float:
-    """The longest way between two states of any episode [m/step]."""
+    """The longest step of any episode [m/step]."""
     ways = [np.linalg.norm(np.diff(np.stack(trace.positions), axis=0), axis=-1) for trace in traces
             if len(trace.positions) > 1]
     return float(np.concatenate(ways).max()) if ways else 0.0
 
 
 def judge(traces: Sequence[Trace], fastest: float | None) -> tuple[JudgedEpisode, ...]:
-    """Every episode, in the order of the seeds; `fastest` is the longest recorded step, where it is known [m/step]."""
+    """Classes of all episodes, in the order of their seeds; `fastest` is the longest recorded step if known [m/step]."""
     fastest = max(fastest_step(traces), fastest or 0.0)
     return tuple(JudgedEpisode(
         seed=trace.seed,
@@ -183,7 +183,7 @@ class Tracer:
 
 
 def failure_strip(trace: Trace, kind: str) -> FilmStrip:
-    """At most `SHOTS` frames of an episode, its first and last ones among them."""
+    """At most `SHOTS` frames of an episode, the first and the last included."""
     picked = np.unique(np.linspace(0, len(trace.shots) - 1, min(SHOTS, len(trace.shots))).astype(int))
     frames, captions = [], []
     for number in picked:
@@ -196,9 +196,9 @@ def failure_strip(trace: Trace, kind: str) -> FilmStrip:
 
 
 def watch(player: Player, seeds: Sequence[int], fastest: float | None) -> Failures:
-    """Run the episodes and judge each by the longest recorded step [m/step]."""
+    """Run the episodes and classify each; `fastest` is the longest recorded step if known [m/step]."""
     tracer = Tracer(every=5)
-    for _ in player.rollout(min(BATCH, len(seeds)), tracer).run(seeds):
+    for _ in player.episodes(seeds, observer=tracer):
         pass
     outcomes = judge(list(tracer.traces.values()), fastest)
     shown = max(outcomes, key=lambda outcome: (outcome.kind != "solved", outcome.steps))

@@ -28,32 +28,32 @@ from velap.training.encoding import encode_rows
 from velap.training.loop import HOLDOUT_EPISODES, holdout_episodes
 
 PAIRS = 1000
-"""Pairs of states of other trajectories, of each kind. ours."""
+"""Pairs of states of different trajectories, of each kind. ours."""
 REAL_STATES = 4000
 """Frames of the dataset that a latent is compared with. ours: a few seconds of encoding."""
 FEW = 16
-"""Episodes that are looked at where none was held out. ours, as `holdout_episodes`."""
+"""Episodes that are examined if none was held out. ours, as `holdout_episodes`."""
 REWARDED = 3
 """Rewarded episodes that Q^g is drawn along. ours."""
 LAST = 20
-"""Steps before the reward over which Q^g has to rise; farther away it may be flat, a tree searches there [steps]. ours."""
+"""Q^g has to rise over this number of steps before the reward; farther away the tree searches [steps]. ours."""
 LED = 5
 """The value of an action is compared with that of the state this number of steps later [steps]. ours: recorded actions last
 some steps, and one step is hardly more than the noise of a value."""
 FEWEST = 50
-"""Transitions that a correlation is taken over at least. ours."""
+"""Fewest transitions of a correlation. ours."""
 APART = 2.0
 """Two states are apart where the agent needs more than this times the steps that count as arrived. ours."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """A dataset, and the episodes of it that are looked at."""
+    """A dataset, and the episodes of it that are examined."""
 
     store: FrameStore
     sampler: WindowSampler
     episodes: NDArray[np.int64]
-    """[E] episodes that are looked at."""
+    """[E] episodes that are examined."""
     held_out: bool
     """None of them was trained on."""
     positions: NDArray[np.float32] | None
@@ -61,13 +61,13 @@ class Recorded:
 
     @property
     def spans(self) -> list[tuple[int, int]]:
-        """First and last row of the episodes."""
+        """First and last row of each episode."""
         starts, lengths = self.store.episode_start[self.episodes], self.store.episode_length[self.episodes]
         return [(int(start), int(start + length)) for start, length in zip(starts, lengths, strict=True)]
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """Rows of those episodes, one after the other."""
+        """Rows of the episodes, concatenated."""
         return np.concatenate([np.arange(first, last + 1) for first, last in self.spans])
 
     @property
@@ -80,13 +80,18 @@ class Recorded:
         return float(np.quantile(ways, 0.999))
 
 
+def load_as_trained(dataset_id: str, image_key: str | None, model: LatentModel, metadata: Mapping[str, str],
+                    success: str | None = None) -> FrameStore:
+    """A dataset, read as the training data of the checkpoint with `metadata`, except for a camera or rule that is given."""
+    reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else Reading()
+    return load_store(dataset_id, image_key or reading.image_key or None, image_size=model.spaces.height, fit=reading.fit,
+                      success=success or reading.success or None)
+
+
 def open_recorded(dataset_id: str, image_key: str | None, model: LatentModel, config: Config,
                   metadata: Mapping[str, str], success: str | None = None) -> Recorded:
-    """Read a dataset as the checkpoint with `metadata` says that its data were read, but for the camera and the rule of
-    success that are named; raises ConfigError where its actions do not fit the model."""
-    reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else Reading()
-    store = load_store(dataset_id, image_key or reading.image_key or None, image_size=model.spaces.height, fit=reading.fit,
-                       success=success or reading.success or None)
+    """Read a dataset by `load_as_trained`; raises ConfigError where its actions do not fit the model."""
+    store = load_as_trained(dataset_id, image_key, model, metadata, success)
     if len(store.action_low) != model.action_dim:
         raise ConfigError(f"{dataset_id} has actions of {len(store.action_low)} entries, the checkpoint acts by "
                           f"{model.action_dim}; expected the same. Name the dataset that it was trained on with --dataset.")
@@ -119,16 +124,16 @@ def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) 
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutError:
-    """How far h leads from the truth, against how far the truth moves: medians and quartiles over S pairs."""
+    """Error of rollouts by h against the true displacement: quartiles over S pairs."""
 
     lengths: NDArray[np.int64]
     """[K] simulated steps [steps]."""
     error: NDArray[np.float64]
     """[3, K] lower quartile, median, upper quartile [one-step lengths]."""
     moved: NDArray[np.float64]
-    """[3, K] the same of the true displacement [one-step lengths]."""
+    """[3, K] of the true displacement [one-step lengths]."""
     local_steps: NDArray[np.float64]
-    """[3, K] the same of log_γ Q_min from the start to the truth [steps]."""
+    """[3, K] of log_γ Q_min from the start to the true state [steps]."""
     one_step: float
     """Mean distance of subsequent encodings [latent distance]."""
 
@@ -138,7 +143,7 @@ class RolloutError:
 
 
 def rollout_error(horizons: Sequence[Horizon]) -> RolloutError:
-    """Sum up the pairs of every length; the first has length 1."""
+    """Quartiles over the pairs of each length; the first length is 1."""
     one_step = horizons[0].moved.mean().item()
 
     def quartiles(values: Sequence[Tensor], unit: float) -> NDArray[np.float64]:
@@ -154,20 +159,20 @@ def rollout_error(horizons: Sequence[Horizon]) -> RolloutError:
 
 @dataclass(frozen=True, kw_only=True)
 class StatePairs:
-    """States of other trajectories as Q^l sees them from states of the episodes that are looked at."""
+    """Distances by Q^l from states of the examined episodes to states of other trajectories."""
 
     name: str
     local_steps: NDArray[np.float64]
     """[S] log_γ Q_min [steps]."""
     least_steps: NDArray[np.float64] | None
-    """[S] way between the agent's positions at its top speed, a lower bound [steps]; None where positions are unknown."""
+    """[S] lower bound: distance of the positions at top speed [steps]; None where positions are unknown."""
 
     def arrived(self, limit: float) -> float:
-        """Share of the pairs that Q^l calls at most `limit` [steps] apart."""
+        """Share of the pairs that are at most `limit` [steps] apart by Q^l."""
         return float((self.local_steps <= limit).mean())
 
     def aliased(self, limit: float) -> float | None:
-        """Share of the pairs truly apart that Q^l calls at most `limit` [steps] apart; None where no pair is known to be."""
+        """Share of the pairs truly apart that are at most `limit` [steps] apart by Q^l; None without such pairs."""
         if self.least_steps is None:
             return None
         apart = self.least_steps > APART * limit
@@ -176,8 +181,8 @@ class StatePairs:
 
 def other_pairs(model: LatentModel, recorded: Recorded, reach: int, rng: np.random.Generator,
                 count: int = PAIRS) -> list[StatePairs]:
-    """Pairs with episodes recorded at most `reach` [episodes] before or after, which tend to share a scene, and with the
-    others."""
+    """Pairs with neighbouring episodes, at most `reach` [episodes] before or after, which tend to share a scene, and with
+    far ones."""
     store = recorded.store
     start = rng.choice(recorded.rows, count)
     episode = store.episode_of[start]
@@ -206,7 +211,7 @@ def local_steps(model: LatentModel, start: Tensor, goal: Tensor) -> NDArray[np.f
 
 
 def _least_steps(recorded: Recorded, start: NDArray[np.int64], goal: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Distance of the agent's positions by the fastest of its recorded steps [steps]."""
+    """Distance of the positions at the fastest recorded speed [steps]."""
     places, fastest = recorded.positions, recorded.fastest
     if places is None or not fastest:
         return None
@@ -224,7 +229,7 @@ class ValueCurve:
 
     @property
     def ideal(self) -> NDArray[np.float64]:
-        """[T] γ^(steps before the rewarded one): what following this episode is worth."""
+        """[T] γ^(steps before the rewarded action): the value of following this episode."""
         return np.asarray(q_from_steps(1.0, self.discount)) ** np.arange(len(self.values) - 2, -1, -1)
 
     @property
@@ -235,7 +240,7 @@ class ValueCurve:
 
     @property
     def steps_error(self) -> float:
-        """Median of how far log_γ Q^g is off the steps that are left [steps]."""
+        """Median error of log_γ Q^g as the number of steps left [steps]."""
         read = steps_from_q(torch.from_numpy(self.values[:-1]), self.discount).numpy()
         return float(np.median(np.abs(read - np.arange(len(read) - 1, -1, -1))))
 
@@ -247,7 +252,7 @@ def value_curve(model: LatentModel, label: str, latents: Tensor) -> ValueCurve:
 
 
 def rewarded_curves(model: LatentModel, recorded: Recorded, count: int = REWARDED) -> list[ValueCurve]:
-    """Q^g along the longest rewarded episodes of the dataset; most of them were trained on."""
+    """Q^g along the longest rewarded episodes of the dataset, most of which were trained on."""
     store = recorded.store
     rewarded = np.flatnonzero(np.bincount(store.episode_of, weights=store.rewards) > 0)
     longest = rewarded[np.argsort(-store.episode_length[rewarded], kind="stable")][:count]
@@ -261,21 +266,20 @@ def rewarded_curves(model: LatentModel, recorded: Recorded, count: int = REWARDE
 
 @dataclass(frozen=True, kw_only=True)
 class ActionValues:
-    """What Q^g promises of recorded actions, against what has come of them some steps later; S transitions.
+    """Q^g of recorded actions against Q^g of the states that followed; S transitions.
 
-    π^g climbs Q^g over actions, so this tells whether it can know where to go; values along episodes do not, as they may be
-    right at states and blind to actions.
+    π^g climbs Q^g over actions, so this shows whether Q^g distinguishes actions. Values along episodes do not show that.
     """
 
     away: NDArray[np.float64]
     """[S] log_γ Q^g(z, π^g(z)) before the action [steps]."""
     promised: NDArray[np.float64]
-    """[S] steps that the recorded action is better than π^g's by Q^g [steps]."""
+    """[S] steps by which Q^g prefers the recorded action to π^g's [steps]."""
     gained: NDArray[np.float64]
-    """[S] steps that Q^g sees the goal come nearer over the next `LED` [steps]."""
+    """[S] steps nearer to the goal by Q^g after the next `LED` steps [steps]."""
 
     def rho(self, far: bool) -> float:
-        """Spearman's rho of promise and gain over the farther or the nearer half; NaN where there are too few."""
+        """Spearman's rho of promise and gain over the farther or the nearer half; NaN below `FEWEST` transitions."""
         half = (self.away > np.median(self.away)) == far if len(self.away) else np.zeros(0, bool)
         if half.sum() < FEWEST:
             return float("nan")
@@ -284,7 +288,7 @@ class ActionValues:
 
 @torch.inference_mode()
 def action_values(model: LatentModel, recorded: Recorded, latents: Tensor) -> ActionValues:
-    """Judge the recorded actions of the episodes that are looked at; latents [R, D] of `recorded.rows`."""
+    """Values of the recorded actions of the examined episodes; latents [R, D] of `recorded.rows`."""
     actions = recorded.sampler.actions[torch.from_numpy(recorded.rows).to(recorded.sampler.device)]
     values, taken = (steps_from_q(q, model.discount).double().cpu().numpy()
                      for q in (model.value(latents), model.global_q(latents, actions)))
@@ -295,7 +299,7 @@ def action_values(model: LatentModel, recorded: Recorded, latents: Tensor) -> Ac
 
 
 def real_states_of(model: LatentModel, recorded: Recorded, rng: np.random.Generator, size: int = REAL_STATES) -> RealStates:
-    """States of the dataset, drawn uniformly from the episodes that are not looked at where there are others."""
+    """States of the dataset, drawn uniformly from the episodes that are not examined, or from all if there are no others."""
     rows = np.setdiff1d(np.arange(len(recorded.store.frames)), recorded.rows if recorded.held_out else [])
     if len(rows) == 0:
         rows = recorded.rows

@@ -1,4 +1,4 @@
-"""What `velap diagnose` measures of plans: trees from several starts, and how real their nodes are.
+"""What `velap diagnose` measures of plans: trees from several starts, and distances of their nodes to real states.
 
 B starts, N stacked frames, H x W pixels, D latent dimensions, M nodes of a tree, L waypoints.
 """
@@ -37,14 +37,14 @@ class TreeNumbers:
     start: str
     nodes: int
     rejected: dict[str, int]
-    """Candidates by the reason, the names of `velap.search.types.Rejections`."""
+    """Rejected candidates by reason, a field of `velap.search.types.Rejections`."""
     start_value: float
     """Q^g at the root [Q-value]."""
     best_value: float
     """Highest Q^g in the tree [Q-value]."""
     reached_goal: bool
     waypoints: int
-    """Of the chosen path, the root left out."""
+    """Of the chosen path, without the root."""
     cost: float
     """[steps]"""
     distance: float
@@ -57,10 +57,10 @@ class Trees:
 
     numbers: tuple[TreeNumbers, ...]
     held_out_distance: float
-    """Mean distance of held-out states to the others: what a real state has [one-step lengths]."""
+    """Mean distance of held-out states to the real states: the value of a real state [one-step lengths]."""
     scene_distance: float | None
-    """Mean distance of the first tree's nodes to real states of their own scene [one-step lengths]; None where these cannot
-    be had."""
+    """Mean distance of the first tree's nodes to real states of their own scene [one-step lengths]; None if these are
+    unknown."""
     scene_spacing: float | None
     """Mean distance of those real states to the nearest other one [one-step lengths]."""
     goal_value: float
@@ -84,7 +84,7 @@ def tree_numbers(starts: Starts, result: Plan, real_states: RealStates, one_step
 
 
 def plan_strip(starts: Starts, result: Plan, real_states: RealStates, one_step: float, row: int = 0) -> FilmStrip:
-    """The chosen path from one start: the start frame itself, then what lies nearest to each waypoint."""
+    """The chosen path from one start: the start frame, then the frame nearest to each waypoint."""
     chosen = planned(result, row)
     values = result.tree.goal_values[row, chosen.path].double().cpu().numpy()
     numbers, distances = real_states.nearest(chosen.waypoints)
@@ -107,8 +107,8 @@ def diagnose_trees(model: LatentModel, config: Config, starts: Starts, *, seeds:
         starts: where from.
         seeds: [B] randomness of each plan.
         real_states: states of the dataset.
-        scenery: states of the first start's own scene, where they can be had; the film strip then shows these.
-        held_out: [R, D] states that were recorded and are not among `real_states`.
+        scenery: states of the first start's own scene if known; the film strip then shows these.
+        held_out: [R, D] recorded states that are not among `real_states`.
         one_step: mean distance of subsequent encodings [latent distance].
     """
     with torch.inference_mode():

@@ -1,6 +1,6 @@
-"""The page of `velap diagnose`: every number with what it should be and what to try where it is not.
+"""The page of `velap diagnose`: each number with what is expected and what to try otherwise.
 
-The bounds are ours: they tell a model that works from one that does not, not a good one from a better one.
+The bounds are ours: they separate models that work from models that do not.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from velap.report.diagnose.command import Diagnosis
 
 ERROR_SHARE = 0.5
-"""A rollout errs by at most this share of the true displacement."""
+"""Largest error of a rollout, as a share of the true displacement."""
 LOCAL_FACTOR = 2.0
-"""Q^l's steps within a trajectory are at most this factor off the steps taken, which are an upper bound themselves."""
+"""Largest factor between Q^l's steps within a trajectory and the steps taken, which are an upper bound."""
 ALIASED = 0.05
-"""Share of states apart that Q^l may call the same."""
+"""Largest share of distant states that count as arrived by Q^l."""
 RHO = 0.7
 """Spearman's rho of learnt and true distances."""
 ACTION_RHO = 0.3
-"""Spearman's rho of what Q^g promises of an action and what comes of it; 0.4 to 0.75 where a task is solved."""
+"""Spearman's rho of Q^g's promise of an action and its outcome; 0.4 to 0.75 where a task is solved."""
 GAIN = 10.0
-"""Steps by Q^g that a plan comes nearer to a goal that it does not find."""
+"""A plan that does not find the goal comes at least this much nearer by Q^g [steps]."""
 SUPPORT_FACTOR = 1.5
 """Nodes of a tree are at most this factor farther from the data than held-out states are."""
 
@@ -45,7 +45,7 @@ class Check:
     title: str
     numbers: str
     good: bool | None
-    """None where there is nothing to judge by."""
+    """None without a bound."""
     expected: str
     advice: str
 
@@ -56,7 +56,7 @@ class Check:
 
 
 def checks(diagnosis: Diagnosis) -> list[Check]:
-    """Everything that was measured, in the order in which a fault spreads: model, distances, values, plans, episodes."""
+    """All checks, in the order in which a fault spreads: model, distances, values, plans, episodes."""
     limit = diagnosis.arrived_steps
     found = [*_of_rollouts(diagnosis.rollout, diagnosis.simulated), *_of_pairs(diagnosis.pairs, limit)]
     found += _of_scenes(diagnosis.scenes, limit) if diagnosis.scenes else []

@@ -27,18 +27,18 @@ from velap.report.diagnose.plans import Starts
 from velap.report.figures import probe
 
 PROBED = 400
-"""States that a maze is judged by. ours."""
+"""Probed states of a maze. ours."""
 GOALS = 16
-"""States of those that distances are taken to. ours."""
+"""Probed states that distances are measured to. ours."""
 NEAR = 20.0
-"""Pairs up to this far apart are what π^l is for [steps]. ours: the random walks of the mazes are as long."""
+"""π^l is for pairs up to this distance [steps]. ours: the length of the mazes' random walks."""
 _POINT = 1e-4
-"""Half side of the goal region that stands for a point [m]."""
+"""Half side of the goal region that replaces a point [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A maze whose true distances are known, against Q^l and Q^g."""
+    """True distances in a maze, and Q^l and Q^g."""
 
     seed: int
     goal_steps: NDArray[np.float64]
@@ -62,12 +62,12 @@ class Scene:
 
     @property
     def near_rho(self) -> float:
-        """The same, pairs up to `NEAR` apart."""
+        """The same for pairs up to `NEAR` apart."""
         near = self.pair_steps <= NEAR
         return rank_correlation(self.pair_local[near], self.pair_steps[near])
 
     def aliased(self, limit: float, apart: float) -> float | None:
-        """Share of the pairs more than `apart` [steps] from each other that Q^l calls at most `limit` [steps] apart."""
+        """Share of the pairs more than `apart` [steps] apart that are at most `limit` [steps] apart by Q^l."""
         far = self.pair_steps > apart
         return float((self.pair_local[far] <= limit).mean()) if far.any() else None
 
@@ -99,7 +99,7 @@ def look_at_scene(model: LatentModel, env: gym.Env[Any, Any], read: FrameReader,
         start = latents[torch.from_numpy(np.flatnonzero(others)).to(latents.device)]
         local.append(local_steps(model, start, latents[goal].expand_as(start)))
     pair_steps, pair_local, goal_steps = np.concatenate(true), np.concatenate(local), world.geodesic_steps(places)
-    # where the block touches a wall, a rounding error may leave it no way at all
+    # rounding may leave a block that touches a wall without any way
     known, reachable = np.isfinite(pair_steps), np.isfinite(goal_steps)
     return Scene(
         seed=seed,
@@ -125,7 +125,7 @@ def first_states(player: Player, env: gym.Env[Any, Any], seeds: Sequence[int]) -
 
 
 def expert_curves(model: LatentModel, env: gym.Env[Any, Any], frame_stack: int, seeds: Sequence[int]) -> list[ValueCurve]:
-    """Q^g along the scripted expert's episodes that succeed; none where the environment has no expert."""
+    """Q^g along the scripted expert's successful episodes; empty without an expert."""
     world: Any = env.unwrapped
     if not isinstance(env.unwrapped, Expert) or env.spec is None or env.spec.max_episode_steps is None:
         return []
