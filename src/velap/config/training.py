@@ -144,8 +144,8 @@ class EnsemblePhase(Phase):
     members: int = 4
     """Policies. ours."""
     noise: float = 0.0
-    """Gaussian noise on the latents that members learn from, in errors of h after ten steps in each dimension. ours: what h
-    cannot predict is no ground to act on."""
+    """Gaussian noise on the latents that members learn from, in deviations of each dimension. ours: φ mistakes places in
+    scenes that it has not seen."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

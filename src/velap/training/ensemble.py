@@ -19,7 +19,6 @@ from velap.losses import Info, cloning_error, critic_loss, global_critic_loss, p
 from velap.models.networks import CRITIC, POLICY, EnsembleMLP
 from velap.models.velap import UNREWARDED
 from velap.training.capture import adam
-from velap.training.encoding import evaluated
 from velap.training.phase import FROZEN_RATE, Frozen, PhaseLearner, Run
 from velap.training.steps import cosine
 
@@ -27,29 +26,6 @@ BATCH = 512
 """Transitions a batch of each member. ours."""
 CLOSE = 1e-4
 """Squared distance of actions, averaged over A, within which the distance has no edge."""
-
-
-HORIZON = 10
-"""Steps after which h's errors count [steps]. ours."""
-
-
-@torch.no_grad()
-def model_errors(run: Run, latents: Tensor) -> Tensor:
-    """Root mean square error of h in every dimension after `HORIZON` steps of the data: float32 [D].
-
-    What h cannot predict is noise to who follows its predictions.
-    """
-    sampler = run.sampler
-    rows = sampler.transitions
-    rows = rows[rows + HORIZON <= sampler.last[rows]]
-    if len(rows) == 0:
-        return torch.zeros(latents.shape[1], device=latents.device)
-    rows = rows[torch.linspace(0, len(rows) - 1, min(len(rows), 4_000), device=rows.device).long()]
-    with evaluated(run.model):
-        z = latents[rows]
-        for step in range(HORIZON):
-            z = run.model.step(z, sampler.actions[rows + step])
-    return (z - latents[rows + HORIZON]).square().mean(0).sqrt()
 
 
 class EnsembleLearner(PhaseLearner[EnsemblePhase]):
@@ -73,8 +49,8 @@ class EnsembleLearner(PhaseLearner[EnsemblePhase]):
         learnt = {"critics": [*self.critics.parameters()], "policies": [*self.policies.parameters()],
                   "taught": [*model.global_policy.parameters(), *model.global_critic.parameters()]}
         self.optimizers = {name: adam(parameters, FROZEN_RATE) for name, parameters in learnt.items()}
-        self.deviation = model_errors(run, self.latents)
-        """float32 [D], what h errs by in each dimension."""
+        self.deviation = self.latents.std(0)
+        """float32 [D], of each dimension over the data."""
 
     def update(self, done: int) -> Info:
         """One update of the members, or after those of what they teach."""

@@ -53,7 +53,6 @@ class Frozen:
     def __init__(self, run: Run) -> None:
         model = run.model
         model.encoder.requires_grad_(False).eval()
-        model.encoder.complete(run.sampler.frames, run.sampler.last, run.seed)
         self.latents = encode_all(model, run.sampler, run.features)
         """float32 [F, D] of every frame of the dataset."""
         rows = run.sampler.transitions

@@ -49,9 +49,6 @@ class Encoder(nn.Module):
         """
         return self.measure(frames)
 
-    def complete(self, frames: Tensor, last: Tensor, seed: int) -> None:
-        """Learn what the frozen encoder adds to what it learnt; arguments as in `fit`."""
-
     def measure(self, frames: Tensor) -> Tensor:
         """`features` of all frames of the data, in pieces where they are not the frames themselves."""
         return self.features(frames)

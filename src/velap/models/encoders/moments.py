@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from velap.config import ModelConfig
 from velap.models.encoders.base import Encoder, Target
-from velap.models.encoders.conv import DENSE, ConvEncoder
+from velap.models.encoders.conv import DENSE
 from velap.models.networks import MLP
 from velap.registry import register_encoder
 
@@ -223,55 +223,3 @@ class SlowMomentEncoder(MomentEncoder):
     def kept(self, newest: Tensor) -> Tensor:
         """Slow features [M, S]."""
         return ((newest - self.slow_mean) @ self.slow_directions).clamp(-KEPT_LIMIT, KEPT_LIMIT)
-
-
-@register_encoder("union")
-class UnionEncoder(ConvEncoder):
-    """φ of Table 2, and behind it the colour moments of the newest frame, each as far as it is more than noise (ours).
-
-    The convolutions learn what h can predict; moments tell places to a tenth of a pixel. While the convolutions learn, the
-    moments are zero: they would tell states apart in the convolutions' place.
-    """
-
-    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
-        super().__init__(config, size)
-        self.moments = ColourMoments(COLOURS, size)
-        self.register_buffer("kept_scale", torch.zeros(6 * COLOURS))
-        self.kept_scale: Tensor
-        """float32 [C], what each standardised moment is multiplied by; zeros until `complete`."""
-
-    @classmethod
-    def width(cls, config: ModelConfig) -> int:
-        """D: learnt units and moments."""
-        return config.latent_dim + 6 * COLOURS
-
-    @classmethod
-    def learnt_width(cls, config: ModelConfig) -> int:
-        """Units of the dense layers."""
-        return config.latent_dim
-
-    @torch.no_grad()
-    def complete(self, frames: Tensor, last: Tensor, seed: int) -> None:
-        """Palette, scale and weights of the moments, from frames all over the data.
-
-        A moment counts by the square of its autocorrelation over one step: rasterisation noise has none.
-        """
-        rows = np.linspace(0, len(frames) - 2, min(FRAMES, len(frames) - 1)).astype(np.int64)
-        chosen = torch.from_numpy(rows).to(frames.device)
-        self.moments.fit(frames[chosen].cpu().numpy(), seed)
-        chosen = chosen[chosen < last[chosen]]
-        now, then = self.moments(frames[chosen]), self.moments(frames[chosen + 1])
-        change = (then - now).square().mean(0)
-        spread = torch.cat([now, then]).var(0).clamp(min=1e-6)
-        self.kept_scale.copy_(KEPT_SCALE * (1 - change / (2 * spread)).clamp(0, 1).square())
-
-    def encode(self, stacks: Tensor) -> Tensor:
-        """uint8 [M, N, H, W, 3] → [M, D]."""
-        learnt = self.learnt(stacks)
-        if not self.kept_scale.any():
-            return torch.cat([learnt, learnt.new_zeros(len(learnt), len(self.kept_scale))], -1)
-        return torch.cat([learnt, self.kept_scale * self.moments(stacks[:, -1])], -1)
-
-    def learnt(self, stacks: Tensor) -> Tensor:
-        """Table 2: uint8 [M, N, H, W, 3] → [M, d_Z]."""
-        return super().encode(stacks)
