@@ -118,6 +118,7 @@ def test_memory_does_not_grow_with_mapped_frames(tmp_path: Path) -> None:
     assert small["RssAnon"] < 600e6
 
 
+@pytest.mark.timeout(600)
 def test_memory_of_a_training_does_not_grow_with_mapped_frames(tmp_path: Path) -> None:
     """Through a phase of every kind, diagnostics, saving and the end."""
     small, large = (run(TRAIN, rows, tmp_path, PYTHONPATH=PATH) for rows in (10_000, 60_000))
