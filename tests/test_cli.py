@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import os
 import re
 import resource
@@ -27,6 +28,7 @@ from velap.methods.base import get_method
 from velap.models.checkpoint import load_checkpoint, save_checkpoint
 from velap.models.velap import LatentModel, Spaces
 from velap.tasks import TASKS, make_config
+from velap.training.loggers import DEFAULT
 
 ROOT = Path(__file__).resolve().parents[1]
 OLD_RECORDS = ROOT / "results/records-five-recipes"
@@ -136,6 +138,31 @@ def test_every_set_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert cli.main(["info", "--set", "train.c0=1", "train.c3=2", "--set", "planner.n_sim=3"]) == 0
     assert cli.main(["info"]) == 0
     assert seen == [{"train": {"c0": 1, "c3": 2}, "planner": {"n_sim": 3}}, {}]
+
+
+def test_train_has_every_option_of_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Options are taken from the command line and reach `velap.train` as they were given."""
+    seen: dict[str, Any] = {}
+
+    def trained(source: str, **options: Any) -> Path:
+        seen.update(options, source=source)
+        return Path("model.safetensors")
+
+    offered = set(inspect.signature(velap.train).parameters)
+    monkeypatch.setattr("velap.api.train", trained)
+    typed = ["--dataset", "robot/pile-v0", "--image-key", "camera", "--preset", "paper", "--seed", "7", "--out", "elsewhere",
+             "--device", "cpu", "--resume", "--set", "train.c0=2", "--method", "td3bc", "--success", "terminated",
+             "--fit", "pad", "--image-size", "96", "--mapped"]
+    given = {"source": "robot/pile-v0", "image_key": "camera", "preset": "paper", "seed": 7, "out": Path("elsewhere"),
+             "device": "cpu", "resume": True, "changes": {"train": {"c0": 2}}, "method": "td3bc", "success": "terminated",
+             "fit": "pad", "image_size": 96, "mapped": True}
+    for loggers in ((), ("jsonl",), ("tensorboard", "wandb")):
+        assert cli.main(["train", *typed, "--loggers", *loggers]) == 0
+        own = {"command": seen.pop("command"), "on_progress": seen.pop("on_progress")}
+        assert seen == {**given, "loggers": loggers}
+        assert offered - {"data"} == set(seen) | set(own), "an option of Python that the command line lacks"
+    assert cli.main(["train", "SpiralMaze"]) == 0
+    assert seen["loggers"] == DEFAULT
 
 
 def test_an_evaluation_goes_on_where_it_stopped(capsys: pytest.CaptureFixture[str]) -> None:

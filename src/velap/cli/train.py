@@ -40,7 +40,8 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
 def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: str | None = None,
           preset: Preset = "default", seed: int = 0, out: Path | None = None, device: Device = "auto", resume: bool = False,
           settings: Settings = (), method: Method = "velap", success: str | None = None,
-          fit: Literal["crop", "pad", "squash"] | None = None, image_size: int = 64, mapped: bool = False) -> None:
+          fit: Literal["crop", "pad", "squash"] | None = None, image_size: int = 64, mapped: bool = False,
+          loggers: tuple[Literal["jsonl", "tensorboard", "wandb"], ...] = ("jsonl", "tensorboard")) -> None:
     """Train on a task's dataset or on any dataset of images and continuous actions.
 
     All methods share the joint training; it is done first where its checkpoint is missing. BC, IQL and IRIS then learn on
@@ -58,6 +59,7 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
         fit: How images that are not square become square.
         image_size: Side that images are resized to [px].
         mapped: Map the frames from a file beside the dataset instead of reading them into memory.
+        loggers: Where losses go; `--loggers` alone writes none.
     """
     if (task is None) == (dataset is None):
         raise ConfigError(f"got the task {task!r} and the dataset {dataset!r}; expected one of them: `velap train TASK` or "
@@ -67,13 +69,13 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
 
         get_task(task)
     train_with_progress(str(task or dataset), preset=preset, seed=seed, out=out, image_key=image_key, device=device,
-                        resume=resume, settings=settings, method=method,
+                        resume=resume, settings=settings, method=method, loggers=loggers,
                         reading={"success": success, "fit": fit, "image_size": image_size, "mapped": mapped or None})
 
 
 def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None, device: str, resume: bool,
                         settings: Sequence[Sequence[str]], image_key: str | None = None, method: str = "velap",
-                        reading: Mapping[str, Any] | None = None) -> Path:
+                        loggers: Sequence[str] = ("jsonl", "tensorboard"), reading: Mapping[str, Any] | None = None) -> Path:
     """Train and show how far it is; returns the joint checkpoint."""
     from velap import api
     from velap.cli.memory import keep_freed_memory
@@ -91,7 +93,8 @@ def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None
         note(f"no joint checkpoint in {directory}; it is trained first")
     with TrainingBar(OUT) as view:
         checkpoint = api.train(source, preset=preset, seed=seed, out=out, method=method, image_key=image_key, device=device,
-                               resume=resume, changes=changes, command=command(), on_progress=view, **(reading or {}))
+                               resume=resume, changes=changes, command=command(), loggers=loggers, on_progress=view,
+                               **(reading or {}))
     say(f"checkpoint {checkpoint}")
     if kind.learns:
         result = read_result(head_path(checkpoint, method))

@@ -207,17 +207,18 @@ def _scenes(store: FrameStore) -> Scenes:
     share = float(is_still.mean())
     if share < FEWEST_STILL:
         return Scenes(share, episodes, np.zeros(0, np.int64), float("nan"), background)
-    levels = background.astype(np.int16)
+    levels = np.ascontiguousarray(np.moveaxis(background, -1, 0), np.int16)  # channels first: the largest is found faster
     apart = np.zeros((len(episodes), len(episodes)))
-    for number in range(len(episodes)):
-        both = is_still[number] & is_still
-        changed = (np.abs(levels[number] - levels).max(axis=-1) > CHANGED) & both
-        apart[number] = changed.sum(axis=(1, 2)) / np.maximum(both.sum(axis=(1, 2)), 1)
+    for number in range(len(episodes) - 1):
+        others = slice(number + 1, None)
+        both = is_still[number] & is_still[others]
+        changed = (np.abs(levels[:, number, None] - levels[:, others]).max(axis=0) > CHANGED) & both
+        apart[number, others] = apart[others, number] = changed.sum(axis=(1, 2)) / np.maximum(both.sum(axis=(1, 2)), 1)
     following = np.flatnonzero(np.diff(episodes) == 1)
     together = float((apart[following, following + 1] <= SAME_SCENE).mean()) if len(following) else float("nan")
     labels = np.ones(1, np.int64)
     if len(episodes) > 1:
-        labels = fcluster(linkage(squareform((apart + apart.T) / 2, checks=False), "average"), SAME_SCENE, "distance")
+        labels = fcluster(linkage(squareform(apart, checks=False), "average"), SAME_SCENE, "distance")
     return Scenes(share, episodes, labels.astype(np.int64), together, background)
 
 

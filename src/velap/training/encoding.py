@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from velap.data.sampling import WindowSampler
+from velap.models.encoders.base import in_parts
 from velap.models.velap import LatentModel
 
 
@@ -32,8 +33,7 @@ def commands_before(model: LatentModel, sampler: WindowSampler, rows: Tensor) ->
 
 def encode_rows(model: LatentModel, sampler: WindowSampler, rows: Tensor, chunk: int = 1024) -> Tensor:
     """Latents of rows of the dataset: int64 [M] -> [M, D]."""
-    parts = rows.split(chunk)
-    return torch.cat([model.encode(sampler.stacks(part), commands_before(model, sampler, part)) for part in parts])
+    return in_parts(lambda part: model.encode(sampler.stacks(part), commands_before(model, sampler, part)), rows, chunk)
 
 
 @torch.no_grad()
@@ -43,6 +43,5 @@ def encode_all(model: LatentModel, sampler: WindowSampler, features: Tensor | No
     rows = torch.arange(len(sampler.frames), device=sampler.device)
     with evaluated(model):
         measured = model.encoder.measure(sampler.frames) if features is None else features
-        parts = rows.split(model.encoder.chunk)
-        seen = torch.cat([model.encoder.encode(measured[sampler.stack_rows(part)]) for part in parts])
+        seen = in_parts(lambda part: model.encoder.encode(measured[sampler.stack_rows(part)]), rows, model.encoder.chunk)
         return model.with_commands(seen, commands_before(model, sampler, rows))

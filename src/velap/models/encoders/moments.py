@@ -17,7 +17,7 @@ from scipy.linalg import eigh
 from torch import Tensor, nn
 
 from velap.config import ModelConfig
-from velap.models.encoders.base import Encoder, Target
+from velap.models.encoders.base import Encoder, Target, in_parts
 from velap.models.encoders.conv import DENSE
 from velap.models.networks import MLP
 from velap.registry import register_encoder
@@ -82,8 +82,7 @@ class ColourMoments(nn.Module):
         middles = (np.arange(2**BITS) + 0.5) * 2 ** (8 - BITS)
         grid = np.stack(np.meshgrid(middles, middles, middles, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
         self.palette.copy_(torch.from_numpy(found.predict(grid).astype(np.uint8)).view_as(self.palette))
-        chunks = torch.from_numpy(frames).to(self.palette.device).split(500)
-        moments = torch.cat([self.measure(chunk) for chunk in chunks])
+        moments = in_parts(self.measure, torch.from_numpy(frames).to(self.palette.device), 500)
         self.mean.copy_(moments.mean(0))
         self.deviation.copy_(moments.std(0).clamp(min=1e-3))
 
@@ -163,7 +162,7 @@ class MomentEncoder(Encoder):
 
     def measure(self, frames: Tensor) -> Tensor:
         """The same of all frames of the data, in pieces that fit a cache."""
-        return torch.cat([self.features(part) for part in frames.split(500)])
+        return in_parts(self.features, frames, 500)
 
     def encode(self, stacks: Tensor) -> Tensor:
         """Moments of a stack [M, N, C] → [M, D]."""
