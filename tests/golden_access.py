@@ -336,7 +336,7 @@ def checkpoint_facts(task: str) -> dict[str, Any]:
 def hashes_of_content(task: str) -> tuple[str, str]:
     """`weights_sha256` computed anew from the file's tensors and config, and what its metadata says."""
     tensors, metadata = load_tensors(released(task))
-    return content_sha256(tensors, {"config": metadata["config"]}), metadata["weights_sha256"]
+    return content_sha256(tensors, {"config": Config.from_json(metadata["config"]).hash()}), metadata["weights_sha256"]
 
 
 def tensors_that_went(task: str) -> int:

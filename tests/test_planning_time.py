@@ -73,7 +73,8 @@ def test_an_interrupted_point_goes_on(tmp_path: Path) -> None:
 
 def test_settings_reach_the_planners(tmp_path: Path) -> None:
     changes = Point("SpiralMaze", "velap", (250, 10, 20)).changes()
-    assert changes["planner"] == {"n_iter": 250, "n_sim": 10, "candidates": 20, "discard_low_exponent": 20.0}
+    assert changes["planner"] == {"provenance": False, "n_iter": 250, "n_sim": 10, "candidates": 20,
+                                  "discard_low_exponent": 20.0}
     assert changes["controller"]["n_replan"] == 25
     assert Point("SpiralMaze", "mppi", (2, 10, 100)).changes()["mppi"] == {
         "iterations": 2, "horizon": 10, "samples": 100, "elites": 25}
