@@ -154,7 +154,6 @@ SMALL_SIZES: dict[str, Any] = {
     "velap.models.velap.POLICY": (16,),
     "velap.training.encoder.SIDE": 16,
     "velap.training.ensemble.CRITIC": (16,),
-    "velap.training.ensemble.HORIZON": 3,
     "velap.training.ensemble.POLICY": (16,),
     "velap.training.joint.WholeWindows": lambda windows, length, *_: WholeWindows(windows, length, 12, 10, 3),
 }

@@ -55,7 +55,6 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model.step_distance.fill_(0.5)
     model.bank_latents.normal_()
     model.bank_rows.copy_(torch.arange(8))
-    model.missed.fill_(0.1)
     save_checkpoint(path, model, config, {"seed": "3"})
     _, _, metadata = load_checkpoint(path)
     for method in learning_methods():

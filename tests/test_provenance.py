@@ -10,29 +10,19 @@ import torch
 
 from toy_env import ACTION_SCALE, ToyEnv, ToyModel, draw, toy_config
 from toy_world import GOAL, START, TIP, crosses_wall, geodesic, move, roots, row_generators, straight_to_goal, toy_fns
-from velap.config import override
 from velap.config.planning import PlannerConfig
-from velap.errors import ConfigError
 from velap.methods.base import make_agent
 from velap.methods.provenance import PATIENCE, ProvenanceAgent
 from velap.methods.tree_agent import Actor
 from velap.methods.velap import VelapAgent, VelapSettings
-from velap.models.horizon import q_from_steps
 from velap.registry import PLANNERS
 from velap.search import est
-from velap.search.provenance import Provenance, plan
-from velap.search.risk import AHEAD, COST, DISTANCES, PRIOR, Risk, measured_risk
+from velap.search.provenance import RISK, Provenance, plan
 
 CONFIG = PlannerConfig(n_iter=400, n_sim=5, discard_low_exponent=10.0)
 
 
-def flat_risk(of_model: float, *of_policies: float) -> Risk:
-    """A risk that is the same at all distances."""
-    return Risk(of_model, torch.tensor(of_policies or (0.0,)).unsqueeze(1).expand(-1, len(DISTANCES) + 1))
-
-
-def search(start: tuple[float, float], risk: Risk | None = None, **changes: object) -> Provenance:
-    risk = flat_risk(30.0) if risk is None else risk
+def search(start: tuple[float, float], risk: float = RISK, **changes: object) -> Provenance:
     return plan(toy_fns(**changes), torch.tensor([start]), CONFIG, row_generators(1), policies=[straight_to_goal], risk=risk)
 
 
@@ -48,7 +38,7 @@ def test_the_policys_own_way_is_taken_where_it_leads_to_the_goal() -> None:
     assert found.reached_goal.all()
     assert {who for _, _, who in edges(found)} == {1}
     assert len(edges(found)) <= 2
-    assert not (search((1.0, -8.0), flat_risk(0.0)).proposers == 1).all(), "edges of g are shorter where they carry no risk"
+    assert not (search((1.0, -8.0), 0.0).proposers == 1).all(), "edges of g are shorter where they carry no risk"
 
 
 def test_an_edge_of_the_policy_is_its_own_walk_of_n_sim_steps() -> None:
@@ -89,7 +79,7 @@ def test_an_edge_costs_n_sim_steps_by_the_policy_and_its_distance_by_g() -> None
 
 
 def test_a_row_is_planned_by_its_own_generator_alone() -> None:
-    z_root, fns, risk = roots(3, spread=3.0), toy_fns(), flat_risk(30.0)
+    z_root, fns, risk = roots(3, spread=3.0), toy_fns(), 30.0
     together = plan(fns, z_root, CONFIG, row_generators(3, 5), policies=[straight_to_goal], risk=risk)
     for row in range(3):
         alone = plan(fns, z_root[row : row + 1], CONFIG, row_generators(1, 5 + row), policies=[straight_to_goal], risk=risk)
@@ -176,51 +166,3 @@ def test_the_config_and_the_planner_decide_which_agent_acts(monkeypatch: pytest.
     agent = make_agent("velap", model, toy_config(provenance=True), space,  # type: ignore[arg-type]
                        settings=VelapSettings("mine"))
     assert type(agent) is VelapAgent, "another planner's waypoints are followed by Algorithm 2"
-
-
-def test_provenance_without_a_bank_is_refused() -> None:
-    with pytest.raises(ConfigError, match="`provenance` is True; expected false where `bank_size` is 0"):
-        override(toy_config(provenance=True), model={"bank_size": 0})
-
-
-# what edges risk
-
-
-def test_the_risk_is_that_of_the_promises_that_h_does_not_keep() -> None:
-    """A line: the goal is at 0, Q^g counts the way to it, and `half` walks half a step where a whole one is promised."""
-    fns = toy_fns(value=lambda z: q_from_steps(1, 0.96) ** z[..., 0].abs(), step=lambda z, action: z + action)
-    walk, stay = (lambda z, length=length: -length * torch.sign(z) for length in (0.5, 0.0))
-    states = torch.tensor([[8.0], [30.0], [30.0], [100.0], [2.0]], dtype=torch.float64)  # the last one is near the goal
-    risk = measured_risk(fns, [walk, stay], states, missed=0.4)
-    # `half` gets 5 of the 8 steps at 8 and 5 of 10 elsewhere; every class is filled up with PRIOR times the mean
-    kept = [5 / 8, 0.5, 0.5, 0.5]
-    usual = sum(kept) / 4
-    expected = [(5 / 8 + PRIOR * usual) / (1 + PRIOR), (1.0 + PRIOR * usual) / (2 + PRIOR), usual,
-                (0.5 + PRIOR * usual) / (1 + PRIOR), usual]
-    assert AHEAD == 10 and risk.of_model == pytest.approx(0.4 * COST)
-    np.testing.assert_allclose(risk.of_policies, [[COST * (1 - share) for share in expected], [COST] * 5], rtol=1e-5)
-    proposers, starts = torch.tensor([1, 1, 2]), torch.tensor([8.0, 100.0, 30.0])
-    np.testing.assert_allclose(risk.of_policy(proposers, starts), risk.of_policies[[0, 0, 1], [0, 3, 1]])
-
-
-def test_what_nothing_is_known_of_keeps_no_promise() -> None:
-    risk = measured_risk(toy_fns(), [straight_to_goal], torch.zeros(0, 2), missed=1.0)
-    assert risk.of_model == COST and (risk.of_policies == COST).all()
-
-
-def test_a_dearer_way_to_the_same_place_is_no_news_and_a_cheaper_one_is() -> None:
-    """All walks end at one place, 5 steps from the root. π^g's walk from the root is there first, at a cost of 5 and its
-    risk. An edge of g to it is news where that cost is no less than its own and n_sim = 5 more."""
-    place = torch.tensor([-1.0, 0.0])
-
-    def ways(of_model: float, of_policy: float) -> int:
-        """How many nodes lie at the place."""
-        fns = toy_fns(step=lambda z, action: place.expand_as(z), value=lambda z: torch.full(z.shape[:-1], 0.1))
-        found = plan(fns, torch.tensor([START]), replace(CONFIG, n_iter=20, candidates=2), row_generators(1),
-                     policies=[straight_to_goal], risk=flat_risk(of_model, of_policy))
-        return int(found.tree.size[0]) - 1
-
-    assert ways(30.0, 0.0) == 1
-    assert ways(0.0, 30.0) == 2
-    assert ways(0.0, 4.0) == 1, "cheaper by less than an edge"
-    assert ways(0.0, 6.0) == 2

@@ -65,7 +65,6 @@ def test_every_episode_takes_the_same_actions_in_any_batch(provenance: bool) -> 
     def agent() -> TreeAgent:
         model = ToyModel(act_global=lambda z: (z[..., :1] < 0) * straight_to_goal(z),
                          act_success=lambda z: (z[..., :1] >= 0) * straight_to_goal(z))
-        model.missed.fill_(0.8)
         return kind(model, config)  # type: ignore[arg-type]
 
     acted: set[Actor] = set()

@@ -84,7 +84,6 @@ class ToyModel(nn.Module):
         axis = torch.arange(-9.0, 10.0, 3.0)
         self.bank_latents = torch.cartesian_prod(axis, axis)
         self.bank_rows = torch.arange(len(self.bank_latents))
-        self.missed = torch.tensor(0.2)
         self.encoded_batches: list[int] = []
 
     action_dim, config, memory = 2, ModelConfig(frame_stack=2), 0.0

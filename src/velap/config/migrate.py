@@ -100,7 +100,7 @@ def _acting(raw: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Fields of today's planner and controller for a file of an older schema."""
     if raw["preset"] != "paper":
         planner, controller = PlannerConfig(), ControllerConfig()
-        return vars(planner) | {"provenance": raw["model"].get("bank_size", 1) > 0}, dict(vars(controller))
+        return dict(vars(planner)), dict(vars(controller))
     from velap.config.presets import paper
 
     own = paper(raw["task"])

@@ -22,7 +22,7 @@ class PlannerConfig:
     """Tree search (Algorithm 1, Eq. 6-8, Table 8, App. B.6). Thresholds on Q are given as exponents of γ, as in Table 8."""
 
     provenance: bool = True
-    """Edges remember what proposed them, carry its risk and are walked by it. ours; off in `paper`."""
+    """Edges remember what proposed them and are walked by it; those of g carry a risk. ours; off in `paper`."""
     n_iter: int = 500
     """Expansions a plan, Table 8 (250 in the other tasks than ButtonWall). Counts candidates, not rounds."""
     n_sim: int = 10

@@ -38,8 +38,6 @@ class Config:
         train = self.train
         require(self.model.critic_bounded or train.critic_loss == "mse", "critic_loss", train.critic_loss,
                 "'mse' where `critic_bounded` is off: cross entropy asks for Q-values in [0, 1]")
-        require(self.model.bank_size > 0 or not self.planner.provenance, "provenance", self.planner.provenance,
-                "false where `bank_size` is 0: the risk of edges is measured on the bank")
 
     def to_dict(self) -> dict[str, Any]:
         """Every field by part, phases by kind."""

@@ -19,8 +19,7 @@ from torch import Tensor
 from velap.methods.tree_agent import Actor, TreeAgent
 from velap.models.horizon import steps_from_q
 from velap.search import est, provenance
-from velap.search.provenance import Provenance
-from velap.search.risk import Policy, measured_risk
+from velap.search.provenance import Policy, Provenance
 from velap.search.types import Path, Plan, RowGenerator, SearchFns
 
 if TYPE_CHECKING:
@@ -45,16 +44,12 @@ def proposers_of(fns: SearchFns) -> tuple[Proposer, ...]:
 
 
 def search_of(model: LatentModel, config: Config, fns: SearchFns | None = None) -> Callable[[Tensor, RowGenerator], Plan]:
-    """The search that a config asks for: latents [P, D] and a generator a row → plans.
-
-    With `provenance` the risk of edges is measured on the model's bank first. `fns` None takes those of the model.
-    """
+    """The search that a config asks for: latents [P, D] and a generator a row → plans. `fns`: those of the model."""
     fns = model.search_fns() if fns is None else fns
     if not config.planner.provenance:
         return lambda z, generator: est.plan(fns, z, config.planner, generator)
     policies = [each.policy for each in proposers_of(fns)]
-    risk = measured_risk(fns, policies, model.bank_latents[model.bank_rows >= 0].float(), float(model.missed))
-    return lambda z, generator: provenance.plan(fns, z, config.planner, generator, policies=policies, risk=risk)
+    return lambda z, generator: provenance.plan(fns, z, config.planner, generator, policies=policies)
 
 
 class ProvenanceAgent(TreeAgent):

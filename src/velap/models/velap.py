@@ -79,7 +79,6 @@ class LatentModel(nn.Module):
         self.register_buffer("action_low", torch.tensor(spaces.action_low))
         self.register_buffer("action_high", torch.tensor(spaces.action_high))
         self.register_buffer("step_distance", torch.tensor(0.0))
-        self.register_buffer("missed", torch.tensor(1.0))
         self.register_buffer("bank_gap", torch.tensor(torch.inf))
         # Half precision is a thousandth of a one-step distance and keeps a released checkpoint below 3 MB.
         self.register_buffer("bank_latents", torch.zeros(config.bank_size, latent, dtype=torch.float16))
@@ -90,8 +89,6 @@ class LatentModel(nn.Module):
         self.action_high: Tensor
         self.step_distance: Tensor
         """float32 [], upper 5-percentile of one-step distances in the data [latent distance]."""
-        self.missed: Tensor
-        """float32 [], share of held-out walks that h misses; see `velap.search.risk`."""
         self.bank_gap: Tensor
         """float32 [], how far most held-out latents are from the bank [`step_distance`]."""
         self.bank_latents: Tensor

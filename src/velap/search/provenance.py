@@ -11,7 +11,7 @@ proposer p is policy p - 1.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,12 +22,15 @@ from velap.config.planning import PlannerConfig
 from velap.models.horizon import steps_from_q
 from velap.search.est import Thresholds, Verdict, count_rejections, thresholds
 from velap.search.neighbours import candidate_neighbours, first_come, gained_neighbours, incoming_q
-from velap.search.risk import Policy, Risk
 from velap.search.sampling import Noise, draw_noise, node_distribution, sample_nodes
 from velap.search.simulation import anchored, simulate, value_where
 from velap.search.tree import Candidates, free_slots, insert_, new_tree, take, trace_back, trimmed
 from velap.search.types import Plan, RowGenerator, SearchFns
 
+Policy = Callable[[Tensor], Tensor]
+"""Latents [*, D] → actions [*, A] in [-1, 1]."""
+RISK = 30.0
+"""Of an edge of g [steps]. ours: twice `n_replan`. A risk measured on held-out data was worse, see `docs/experiments`."""
 TRUNK_STEPS = 150
 """Longest walk of a policy from the root before the first round [steps]. ours: the longest episode that most tasks allow."""
 
@@ -73,7 +76,7 @@ class _Growing:
 
 @torch.inference_mode()
 def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGenerator, *, policies: Sequence[Policy],
-         risk: Risk) -> Provenance:
+         risk: float = RISK) -> Provenance:
     """A tree from every root, half of whose expansions are the policies', and a path in it.
 
     Args:
@@ -82,14 +85,14 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
         cfg: n_iter, n_sim, thresholds and mixtures of Algorithm 1; p_policy has no effect.
         generator: one for all rows, or one a row.
         policies: what proposes besides g, at least one.
-        risk: what edges risk.
+        risk: of an edge of g [steps].
     """
     noise = draw_noise(cfg, fns.noise_dim, z_root, generator)
     limits = thresholds(cfg, fns.discount, z_root)
     grown = _Growing(fns, z_root, cfg, len(policies))
     edges = -(-TRUNK_STEPS // cfg.n_sim)
     for number, policy in enumerate(policies, 1):
-        _walk_from_root(grown, fns, cfg, limits, policy, number, edges, risk)
+        _walk_from_root(grown, fns, cfg, limits, policy, number, edges)
     rounds = range(0, cfg.n_iter, cfg.candidates)
     verdicts = []
     for start in rounds:
@@ -105,7 +108,7 @@ def plan(fns: SearchFns, z_root: Tensor, cfg: PlannerConfig, generator: RowGener
 
 
 def _walk_from_root(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, policy: Policy, number: int,
-                    edges: int, risk: Risk) -> None:
+                    edges: int) -> None:
     """The policy's own walk from the root, one node every n_sim steps, until the goal is near or an edge cannot be true.
 
     An edge is not true where Q^l says that it stands still or is longer than its steps: h leaks through walls.
@@ -123,8 +126,7 @@ def _walk_from_root(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits:
         values = fns.value(z_new)
         grown.expanded[number - 1].scatter_(1, at, grown.expanded[number - 1].gather(1, at) | going)
         new = Candidates(z_new, at, values, tree.root_steps.gather(1, at) + cfg.n_sim, torch.zeros_like(at))
-        mine = torch.full_like(at, number)
-        target = grown.insert(new, going, mine, risk.of_policy(mine, grown.steps_to_goal.gather(1, at)).to(values))
+        target = grown.insert(new, going, torch.full_like(at, number), torch.zeros_like(values))
         going = going & (values < limits.goal)
         at = torch.where(going, target, at)
 
@@ -137,7 +139,7 @@ def _walk(fns: SearchFns, z: Tensor, policy: Policy, n_sim: int) -> Tensor:
 
 
 def _expand(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, noise: Noise,
-            policies: Sequence[Policy], risk: Risk) -> Verdict:
+            policies: Sequence[Policy], risk: float) -> Verdict:
     """One round of K candidates: half by the policies, from the nodes that promise most, half by g as in Algorithm 1."""
     tree, discount = grown.tree, fns.discount
     count = noise.node.shape[1]
@@ -168,17 +170,13 @@ def _expand(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresho
 
     # The paths of Eq. 8 in steps: an edge of a policy has n_sim of them.
     steps = torch.where(by_policy, torch.full_like(q_edge, cfg.n_sim), steps_from_q(q_edge, discount))
-    of_policies = risk.of_policy(proposers, grown.steps_to_goal.gather(1, parents)).to(q_edge)
-    risked = torch.where(by_policy, of_policies, risk.of_model)
 
-    # l. 14. A node is too close to nodes that are no dearer: a better way to the same place is novel.
+    # l. 14. A policy's node is too close to policies' nodes only: those of g would cut its way.
     near = candidate_neighbours(tree.latents[:, :slots], used, z_new, fns.d_neigh)
     q_in = incoming_q(fns, near, z_new, feasible, parents, q_edge)
-    cost = tree.root_steps + grown.risk
-    new_cost = cost.gather(1, parents) + steps + risked
-    others = torch.cat([cost[:, :slots], new_cost], 1).gather(1, near.rows.flatten(1)).view_as(near.rows)
+    others = torch.cat([grown.proposers[:, :slots], proposers], 1).gather(1, near.rows.flatten(1)).view_as(near.rows)
     from_parent = near.rows == parents.unsqueeze(-1)
-    too_close = ~(q_in < limits.high) & ((others < new_cost.unsqueeze(-1) + cfg.n_sim) | from_parent)
+    too_close = ~(q_in < limits.high) & ~(by_policy.unsqueeze(-1) & (others == 0) & ~from_parent)
     novel = feasible & ~too_close[:, :, :-count].any(-1)
     accepted = first_come(novel, too_close[:, :, -count:])
 
@@ -188,7 +186,7 @@ def _expand(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresho
     tree.neighbour_counts[:, :slots].add_(gained[:, :slots])
     new = Candidates(z_new, parents, value_where(fns, z_new, accepted), tree.root_steps.gather(1, parents) + steps,
                      gained[:, slots:])
-    grown.insert(new, accepted, proposers.clamp(min=0), risked)
+    grown.insert(new, accepted, proposers.clamp(min=0), torch.where(by_policy, 0.0, risk).to(q_edge))
     idle = proposers < 0  # nothing was left to walk from: no candidate, which counts as no rejection
     return Verdict(accepted | idle, supported | idle, q_edge.masked_fill(idle, 1), std_edge.masked_fill(by_policy | idle, 0))
 

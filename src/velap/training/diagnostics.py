@@ -32,8 +32,6 @@ class Horizon:
     """[S] distance between start and truth [latent distance]."""
     local_steps: Tensor
     """[S] log_γ Q_min from start to truth [steps]."""
-    off: Tensor
-    """[S] log_γ Q_min from the truth to h's prediction [steps]."""
 
 
 @torch.no_grad()
@@ -68,8 +66,7 @@ def horizons(
             truth = latents[start + k]
             q_min, _ = model.reach(latents[start], truth)
             found.append(Horizon(k, (predicted - truth).norm(dim=-1), (truth - latents[start]).norm(dim=-1),
-                                 steps_from_q(q_min, model.discount),
-                                 steps_from_q(model.reach(truth, predicted)[0], model.discount)))
+                                 steps_from_q(q_min, model.discount)))
     return found
 
 
@@ -110,23 +107,17 @@ def measure_latents(model: LatentModel, sampler: WindowSampler, generator: torch
         model.bank_rows.copy_(picked)
 
 
-WALK = 10
-"""Steps of a walk, as in `velap.search.risk` [steps]. ours."""
-MISS = 3.0
-"""A walk that ends farther than this from where h says, by Q^l, is missed [steps]: τ_neigh of Table 8."""
 GAP_SHARE = 0.9
 """Share of held-out latents that lie within `bank_gap`. ours."""
 
 
 @torch.no_grad()
-def measure_trust(model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], cache: Tensor | None) -> None:
-    """Sets `missed` and `bank_gap` from held-out episodes, (first row, last row) each; they stay as they are without any."""
-    walks = horizons(model, sampler, episodes, (WALK,), cache)
-    if walks:
-        model.missed.copy_((walks[0].off > MISS).float().mean())
-    if episodes and model.config.bank_size:
-        rows = torch.cat([torch.arange(first, last + 1) for first, last in episodes]).to(sampler.device)
-        latents = encode_rows(model, sampler, rows) if cache is None else cache[rows]
-        own = torch.isin(model.bank_rows.long(), rows)
-        distance = torch.cdist(latents, model.bank_latents.float()[~own]).amin(1)
-        model.bank_gap.copy_(torch.quantile(distance, GAP_SHARE) / model.step_distance.clamp(min=1e-6))
+def measure_gap(model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], cache: Tensor | None) -> None:
+    """Sets `bank_gap` from held-out episodes, (first row, last row) each; it stays as it is without any."""
+    if not episodes or not model.config.bank_size:
+        return
+    rows = torch.cat([torch.arange(first, last + 1) for first, last in episodes]).to(sampler.device)
+    latents = encode_rows(model, sampler, rows) if cache is None else cache[rows]
+    own = torch.isin(model.bank_rows.long(), rows)
+    distance = torch.cdist(latents, model.bank_latents.float()[~own]).amin(1)
+    model.bank_gap.copy_(torch.quantile(distance, GAP_SHARE) / model.step_distance.clamp(min=1e-6))

@@ -35,7 +35,7 @@ from velap.models.checkpoint import make_model, save_checkpoint
 from velap.models.velap import Spaces
 from velap.runs import make_generator, only_writer, write_atomic
 from velap.training.clone import CloneLearner
-from velap.training.diagnostics import diagnose, measure_latents, measure_trust
+from velap.training.diagnostics import diagnose, measure_gap, measure_latents
 from velap.training.encoder import EncoderLearner
 from velap.training.ensemble import EnsembleLearner
 from velap.training.joint import JointLearner
@@ -227,7 +227,7 @@ class Trainer:
         diagnostics = self.report()
         self.model.eval()
         measure_latents(self.model, self.sampler, make_generator(self.seed, stream=2))
-        measure_trust(self.model, self.sampler, self._held_out(), None if self.frozen is None else self.frozen.latents)
+        measure_gap(self.model, self.sampler, self._held_out(), None if self.frozen is None else self.frozen.latents)
         provenance = {
             "command": command,
             "seed": str(self.seed),
