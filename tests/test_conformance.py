@@ -14,7 +14,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import velap.envs  # noqa: F401 - registers the tasks
-from studies.experts import uniform
 from velap.data import behaviours, worker
 from velap.data import collection as collect
 from velap.data.loading import load_store
@@ -183,7 +182,8 @@ class InThisProcess:
 def test_the_expert_solves_test_starts_and_uniform_actions_do_not(task, seed):
     """A few of the episodes of `velap study experts`."""
     world: Any = made(task).unwrapped
-    policies: list[Callable[[], Any]] = [world.expert_action, uniform(world.action_space, seed)]
+    rng, space = np.random.default_rng(seed), world.action_space
+    policies: list[Callable[[], Any]] = [world.expert_action, lambda: rng.uniform(space.low, space.high)]
     lengths = [play_without_frames(world, act, seed, TASKS[task].max_steps) for act in policies]
     assert lengths[0] is not None
     assert lengths[0] > 10

@@ -82,6 +82,7 @@ def spiral_maze(task: str) -> Config:
         task, "default",
         ModelConfig(frame_stack=1, bank_size=4096),
         TrainConfig(phases=(JointPhase(4_000, c1=0.02), LatentPhase(4_000))),
+        PlannerConfig(n_iter=1000),
     )
 
 
@@ -94,6 +95,7 @@ def obstacle_maze(task: str) -> Config:
             phases=(EncoderPhase(3_000), JointPhase(5_000, rewarded_share=0.01, c1=0.02, reconstruction_side=32),
                     LatentPhase(4_000, rewarded_share=0.01), ValuePhase(8_000, rewarded_share=0.01)),
             critic_loss="cross_entropy", group_windows=6, group_reach=4),
+        PlannerConfig(n_sim=5),
     )
 
 
