@@ -348,7 +348,6 @@ def test_the_command_writes_a_page_and_says_where_it_differs_from_the_record(
         monkeypatch: pytest.MonkeyPatch) -> None:
     toy_at_hand(player)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(viewer, "STATES", 150)
     records = record_file(player, tmp_path / "train0.jsonl", (2,))
     assert main(["view", str(records), "--projection", "pca"]) == 0
     said = capsys.readouterr()
