@@ -10,9 +10,11 @@ import torch
 
 from tiny_training import SMALL as TINY
 from velap.config import Config
+from velap.config.planning import SNAP_GAP
 from velap.errors import CheckpointError, ConfigError, VelapError
 from velap.models.checkpoint import load_checkpoint, save_checkpoint, shared_weights
 from velap.models.velap import LatentModel, Spaces
+from velap.training.diagnostics import measure_gap
 
 SMALL = dataclasses.replace(TINY, latent_dim=5)
 
@@ -93,6 +95,29 @@ def test_project_finds_the_nearest_bank_latent():
     every = torch.cdist(z, model.bank_latents.float())
     torch.testing.assert_close(distance, every.min(1).values)
     torch.testing.assert_close(found, model.bank_latents[every.argmin(1)].float())
+
+
+def test_the_gap_of_the_bank_is_that_of_held_out_latents_to_the_other_ones():
+    model = make_model()
+    cache = torch.zeros(12, 5)
+    cache[:10, 0] = torch.arange(10.0)  # rows 0 to 9 are held out, a latent unit apart
+    cache[10, 0], cache[11, 0] = 0.0, 100.0
+    model.bank_rows.copy_(torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 10, 11]))
+    model.bank_latents.copy_(cache[model.bank_rows.long()])
+    sampler = types.SimpleNamespace(device=torch.device("cpu"))
+    measure_gap(model, sampler, [(0, 4), (5, 9)], cache)  # the bank's own held-out rows, at distance 0, do not count
+    torch.testing.assert_close(model.bank_gap, torch.tensor(8.1 / 0.5))  # nine tenths of 0 to 9, in step distances
+    model.bank_rows.fill_(3)
+    measure_gap(model, sampler, [(0, 4)], cache)
+    measure_gap(model, sampler, [], cache)
+    assert model.bank_gap == pytest.approx(8.1 / 0.5), "nothing to measure it by"
+
+
+@pytest.mark.parametrize(("gap", "snaps"), [(SNAP_GAP - 0.1, True), (SNAP_GAP + 0.1, False), (float("inf"), False)])
+def test_a_dense_bank_lets_the_search_snap(gap, snaps):
+    model = make_model()
+    model.bank_gap.fill_(gap)
+    assert model.search_fns().snaps == snaps
 
 
 def test_encode_takes_any_prefix_and_reads_every_frame_of_the_stack():

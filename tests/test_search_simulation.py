@@ -133,6 +133,16 @@ def test_anchors_snap_to_the_data_and_refuse_what_they_do_not_support() -> None:
     assert (snapped.rejections.unsupported > 10).all()
 
 
+def test_anchors_are_left_to_the_model_where_the_config_says_auto() -> None:
+    def nodes(anchor: str, snaps: bool) -> torch.Tensor:
+        fns = toy_fns(project=grid_projection, snaps=snaps)
+        return plan(fns, roots(2), PlannerConfig(**{**CONFIG.__dict__, "anchor": anchor}), row_generators(2)).tree.latents
+
+    for snaps, same in ((True, "snap"), (False, "none")):
+        assert torch.equal(nodes("auto", snaps), nodes(same, not snaps))
+    assert not torch.equal(nodes("auto", True), nodes("auto", False))
+
+
 def test_anchors_need_a_bank() -> None:
     with pytest.raises(ConfigError, match=r"`anchor` is 'snap'.*bank_size"):
         plan(toy_fns(), roots(1), algorithm_1(anchor="snap"), row_generators(1))

@@ -113,11 +113,14 @@ GAP_SHARE = 0.9
 
 @torch.no_grad()
 def measure_gap(model: LatentModel, sampler: WindowSampler, episodes: list[tuple[int, int]], cache: Tensor | None) -> None:
-    """Sets `bank_gap` from held-out episodes, (first row, last row) each; it stays as it is without any."""
+    """Sets `bank_gap` from held-out episodes, (first row, last row) each, and the bank's latents of the other ones; it stays
+    as it is where there are none of either."""
     if not episodes or not model.config.bank_size:
         return
     rows = torch.cat([torch.arange(first, last + 1) for first, last in episodes]).to(sampler.device)
     latents = encode_rows(model, sampler, rows) if cache is None else cache[rows]
     own = torch.isin(model.bank_rows.long(), rows)
+    if own.all():
+        return
     distance = torch.cdist(latents, model.bank_latents.float()[~own]).amin(1)
     model.bank_gap.copy_(torch.quantile(distance, GAP_SHARE) / model.step_distance.clamp(min=1e-6))
