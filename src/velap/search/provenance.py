@@ -30,7 +30,7 @@ from velap.search.types import Plan, RowGenerator, SearchFns
 Policy = Callable[[Tensor], Tensor]
 """Latents [*, D] → actions [*, A] in [-1, 1]."""
 RISK = 30.0
-"""Of an edge of g [steps]. ours: twice `n_replan`. A risk measured on held-out data was worse, see `docs/experiments`."""
+"""Of an edge of g [steps]. ours: twice `n_replan`. A risk measured on held-out data solved less (ADR 89)."""
 TRUNK_STEPS = 150
 """Longest walk of a policy from the root before the first round [steps]. ours: the longest episode that most tasks allow."""
 
