@@ -8,6 +8,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
+from PIL import ImageFont
 from rich.console import Console
 
 from toy_env import SIDE, ToyModel, toy_env, toy_player
@@ -15,6 +16,7 @@ from toy_world import GOAL, misleading_value
 from velap.errors import CheckpointError, StorageError
 from velap.evaluation.evaluate import Player
 from velap.evaluation.rollout import FrameReader
+from velap.methods.tree_agent import IN_WORDS
 from velap.models import checkpoint
 from velap.report import demo
 from velap.report.figures import LatentMap, can_probe, plan_figure, planned, probe, to_pixels
@@ -48,6 +50,14 @@ def test_a_film_shows_every_step(tmp_path: Path) -> None:
     first = reader.get_data(0)
     assert (np.abs(first.astype(int) - (255, 40, 40)).sum(-1) < 60).any(), "the next waypoint is a red dot"
     assert list(tmp_path.iterdir()) == [tmp_path / "two.mp4"]
+
+
+def test_captions_can_be_drawn_and_fit() -> None:
+    font = ImageFont.load_default(size=12)
+    for words in IN_WORDS.values():
+        assert words.isascii(), "the font has no other letters"
+        ahead = "" if "," in words else "100 ahead, "
+        assert font.getlength(f"Q^g 0.000, {ahead}{words}") < TILE - 6
 
 
 def test_a_failing_film_leaves_nothing(tmp_path: Path) -> None:

@@ -45,13 +45,13 @@ class Actor(StrEnum):
 FOLLOWING = (Actor.LOCAL, Actor.POLICY, Actor.CLONE)
 """Those whose action follows an edge of the current tree."""
 IN_WORDS = {
-    Actor.GOAL: "π^g, goal near",
-    Actor.LOCAL: "π^l, to a waypoint",
-    Actor.POLICY: "π^g, along its edge",
-    Actor.CLONE: "the clone, along its edge",
-    Actor.NOWHERE: "π^g, no way found",
+    Actor.GOAL: "global policy, goal near",
+    Actor.LOCAL: "local policy",
+    Actor.POLICY: "global policy",
+    Actor.CLONE: "clone",
+    Actor.NOWHERE: "global policy, no way found",
 }
-"""Actors as pictures and pages name them."""
+"""Actors as pictures and pages name them; the font of videos has no Greek letters."""
 
 
 class TreeAgent(ABC):
