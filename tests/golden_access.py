@@ -142,7 +142,7 @@ SMALL_SIZES: dict[str, Any] = {
     "velap.models.encoders.conv.DENSE": (8,),
     "velap.models.encoders.conv.FILTERS": (4, 4),
     "velap.models.encoders.conv.KERNELS": (4, 4),
-    "velap.models.encoders.conv.PRECISION": torch.float32,
+    "velap.models.encoders.conv.native_precision": lambda device: torch.float32,
     "velap.models.encoders.conv.STRIDES": (2, 2),
     "velap.models.encoders.moments.COLOURS": 4,
     "velap.models.encoders.moments.DENSE": (8,),

@@ -16,8 +16,8 @@ from velap.config import ControllerConfig, PlannerConfig
 GOLDEN = Path(__file__).parent / "golden"
 ACTION = 1e-4
 """Largest difference of an action [environment's action]: processors round differently."""
-LOSS = 1e-3
-"""Largest relative difference of a loss."""
+LOSS = 1e-2
+"""Largest relative difference of a loss: batch statistics let the rounding of processors grow to 0.3 % in twenty updates."""
 
 
 def read(name: str) -> dict[str, Any]:
