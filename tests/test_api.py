@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import velap
 from tiny_training import QUICK, SMALL, make_store
-from velap.errors import ConfigError
+from velap.data.frames import Reading
+from velap.errors import ConfigError, DatasetError
 
 
 class Circle:
@@ -89,6 +92,51 @@ def test_any_agent_is_evaluated_on_a_task() -> None:
     assert sorted(agent.seeds) == [1000, 1001, 1002]
     with pytest.raises(ConfigError, match="got an agent and no environment"):
         velap.evaluate(agent, episodes=1)
+
+
+def solved(reward: float, info: Any, terminated: bool) -> bool:
+    """A rule of a user: at once."""
+    return True
+
+
+def test_a_rule_and_an_environment_may_be_functions(tmp_path: Path) -> None:
+    def make(size: int = 64) -> gym.Env[Any, Any]:
+        return gym.make("velap.envs:velap/SpiralMaze-v0", disable_env_checker=size == 64)
+
+    summary = velap.evaluate(Circle(), env=make, env_kwargs={"size": 64}, episodes=2, max_steps=4, success=solved)
+    assert (summary.task, summary.successes, summary.mean_steps) == ("make", 2, 1.0)
+    env = make()
+    with pytest.raises(ConfigError, match="a function that makes a new environment at each call"):
+        velap.evaluate(Circle(), env=env, episodes=1)  # type: ignore[arg-type]  # it is the mistake
+    with pytest.raises(ConfigError, match="records to write; expected a Gymnasium id"):
+        velap.evaluate("mine", tmp_path / "model.safetensors", env=make)
+
+
+def test_a_checkpoint_is_its_run_directory_and_data_may_be_a_path(tmp_path: Path) -> None:
+    run = train(out=tmp_path / "run", loggers=[]).parent
+    frames = np.random.default_rng(0).integers(0, 256, (1, 2, 16, 16, 3), np.uint8)
+    expected = velap.load(run / "model.safetensors", "td3bc", device="cpu").act(frames)
+    np.testing.assert_array_equal(velap.load(run, "td3bc", device="cpu").act(frames), expected)
+    velap.train(tiny_config(), make_store(), seed=3, device="cpu", out=run, method="bc", loggers=[],
+                changes={"head": {"steps": 2}})
+    assert velap.load(run, "bc", device="cpu").act(frames).shape == (1, 3), "its head lies beside it"
+    with pytest.raises(DatasetError, match="nowhere"):
+        velap.train(tmp_path / "nowhere.npz")
+
+
+def test_a_head_learns_from_the_data_of_its_joint_checkpoint(tmp_path: Path) -> None:
+    train(out=tmp_path, loggers=[])
+    other = dataclasses.replace(make_store(), content_hash="def", reading=Reading(success="reward>=0.5"))
+    with pytest.raises(ConfigError, match=r"learnt from the data abc, .*the data are def now, read by .*reward>=0.5"):
+        velap.train(tiny_config(), other, seed=3, device="cpu", out=tmp_path, method="bc")
+
+
+@pytest.mark.parametrize("changes", [{"planner.n_iter": 3}, {"planner": 3}])
+def test_changes_of_another_form_show_the_right_one(changes: Any, tmp_path: Path) -> None:
+    for call in (lambda: velap.train("SpiralMaze", changes=changes),
+                 lambda: velap.load(train(out=tmp_path, loggers=[]), changes=changes)):
+        with pytest.raises(ConfigError, match=r"such as \{'planner': \{'n_iter': 500\}\}"):
+            call()
 
 
 def test_every_public_name_loads() -> None:

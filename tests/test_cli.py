@@ -392,6 +392,17 @@ def test_help_and_version_answer_at_once(command: list[str]) -> None:
     assert after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime < 1.0
 
 
+@pytest.mark.parametrize("command", [["evaluate", "--help"], ["config", "SpiralMaze"]])
+@pytest.mark.parametrize("code_page", ["cp1252", "ascii"])
+def test_a_log_file_of_any_code_page_takes_the_output(command: list[str], code_page: str) -> None:
+    """Windows gives a file its own code page, which lacks π."""
+    path = os.pathsep.join(entry for entry in sys.path if entry)
+    done = subprocess.run([sys.executable, "-m", "velap", *command], capture_output=True,
+                          env={**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": code_page})
+    assert done.returncode == 0, done.stderr.decode()
+    assert len(done.stdout) > 1000
+
+
 def test_version_and_the_list_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out == f"velap {velap.__version__}\n"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -76,6 +78,49 @@ def test_a_flipped_view_gives_the_action_of_the_flipped_picture(agent: Agent, fr
     expected = agent.act(frames[:, :, ::-1].copy())
     agent.reset(np.ones(2, bool))
     np.testing.assert_array_equal(agent.act(frames[:, :, ::-1]), expected)
+
+
+def test_pictures_that_cannot_be_written_are_read(agent: Agent, frames: np.ndarray) -> None:
+    """Frames of shared memory or of a server are read-only; torch warns of them."""
+    agent.reset(np.ones(2, bool))
+    expected = agent.act(frames)
+    locked = frames.copy()
+    locked.setflags(write=False)
+    agent.reset(np.ones(2, bool))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(agent.act(locked), expected)
+
+
+WRONG_STARTS = [
+    ((np.array([0]),), r"mask of type int64 and shape \[1\]; expected bool \[B\]"), (([1, 0],), "mask of type int64"),
+    ((True,), r"mask of type bool and shape \[\]"), ((None,), "mask of type object"),
+    ((np.ones((2, 1), bool),), r"\[2, 1\]"),
+    ((np.zeros(0, bool),), r"shape \[0\]"), ((np.ones(2, bool), 7), r"seeds of type int64 and shape \[\]"),
+    ((np.ones(2, bool), [7]), "an integer of 0 or more for each of the 2 rows"), ((np.ones(2, bool), [-1, 0]), "0 or more"),
+    ((np.ones(2, bool), [0.5, 1.0]), "seeds of type float64")]
+
+
+@pytest.mark.parametrize(("start", "text"), WRONG_STARTS)
+def test_a_wrong_start_is_named_and_leaves_the_episode_as_it_is(agent: Agent, frames: np.ndarray, start: tuple[Any, ...],
+                                                                text: str) -> None:
+    """Numbers of rows are not a mask, and one seed is not one for each row."""
+    agent.reset(np.ones(2, bool), np.array([4, 5]))
+    expected = [agent.act(frames) for _ in range(2)]
+    agent.reset([True, True], [4, 5])
+    first = agent.act(frames)
+    with pytest.raises(ObservationError, match=text):
+        agent.reset(*start)
+    np.testing.assert_array_equal([first, agent.act(frames)], expected)
+
+
+@pytest.mark.parametrize("method", ["mppi", "random"])
+def test_every_kind_of_agent_names_a_wrong_start(method: str, agent: Agent) -> None:
+    config = make_config("SpiralMaze")
+    model = LatentModel(config.model, Spaces(64, 64, (-1.0,) * 2, (1.0,) * 2), config.train.discount)
+    for start, text in WRONG_STARTS:
+        with pytest.raises(ObservationError, match=text):
+            make_agent(method, model, config, ACTIONS).reset(*start)
 
 
 def test_random_actions_need_a_batch_as_well() -> None:

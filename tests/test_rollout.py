@@ -133,6 +133,56 @@ def test_a_foreign_environment_is_read_by_the_rules_of_datasets() -> None:
     assert (image.shape, image.dtype, int(image.max())) == ((8, 8, 3), np.uint8, 40)
 
 
+class Reusing(Foreign):
+    """Writes each picture into the memory of the one before, takes no options, and gives rewards of one entry."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.memory, self.time = np.zeros((1, 16, 16), np.uint8), 0
+
+    def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:  # type: ignore[override]
+        self.time = 0
+        return self._observe(), {}
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        self.memory[:] = 10 * self.time
+        return {"camera": self.memory, "speed": np.zeros(2, np.float32)}
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self.time += 1
+        return self._observe(), self.reward(), False, False, {}
+
+    def reward(self) -> Any:
+        return np.array([float(self.time == 4)])
+
+
+class Watching(RandomAgent):
+    """Random actions; keeps the brightness of what it sees."""
+
+    def __init__(self) -> None:
+        super().__init__(gym.spaces.Box(-1, 1, (2,), np.float64), 2)
+        self.seen: list[list[int]] = []
+
+    def act(self, frames: np.ndarray) -> np.ndarray:
+        self.seen.append(frames[0, :, 0, 0, 0].tolist())
+        return super().act(frames)
+
+
+def test_an_environment_may_reuse_the_memory_of_its_pictures() -> None:
+    env, agent = Reusing(), Watching()
+    (episode,) = Rollout([env], agent, FrameReader(env, 16)).run([0])
+    assert episode.success and episode.steps == 4
+    assert agent.seen == [[0, 0], [0, 10], [10, 20], [20, 30]], "a state keeps the pictures as they were"
+
+
+@pytest.mark.parametrize("reward", [None, np.zeros(2), "one"])
+def test_a_reward_that_is_no_number_is_named(reward: Any) -> None:
+    env = Reusing()
+    env.reward = lambda: reward
+    with pytest.raises(ConfigError, match=r"reward .*expected one number"):
+        list(Rollout([env], Watching(), FrameReader(env, 16)).run([0]))
+
+
 def test_wrong_images_and_keys_are_named() -> None:
     with pytest.raises(DatasetError, match=r"no observation key 'eye'.*camera"):
         FrameReader(Foreign(), 8, "eye")

@@ -13,8 +13,9 @@ from latent_data import joint_checkpoint, noise_store
 from tiny_training import make_store
 from velap.data.mapped import open_or_build
 from velap.errors import StorageError
+from velap.evaluation.records import record_path
 from velap.methods.learning import train_head
-from velap.storage import locked
+from velap.storage import locked, run_dir
 from velap.training import frozen
 
 
@@ -33,6 +34,13 @@ def take_turns(path: Path, turns: int, clashes: multiprocessing.Queue[int]) -> N
         except BlockingIOError:
             pass
     clashes.put(clashed)
+
+
+def test_every_id_is_a_folder_on_every_system() -> None:
+    assert run_dir("my_package:Robot-v0", "default", 0) == Path("runs/my_package_Robot-v0/default/seed0")
+    assert run_dir(r"C:\data\robot.npz", "default", 0) == Path("runs/C__data_robot.npz/default/seed0")
+    records = record_path(Path("r"), "../other:Env-v0", "velap", "default", 1)
+    assert records == Path("r/.._other_Env-v0/velap-default/train1.jsonl")
 
 
 def test_a_lock_has_one_holder_however_often_it_changes_hands(tmp_path: Path) -> None:

@@ -38,7 +38,8 @@ def store(success: Any = None, made: list[Episode] | None = None) -> FrameStore:
 
 
 @pytest.mark.parametrize("text", ["reward>=1", "reward>=-0.5", "info:success", "info:coverage>=0.95", "info:next.reward>=1",
-                                  "terminated", "labels:a/b.csv", "python:my.module:solved"])
+                                  "terminated", "labels:a/b.csv", "python:my.module:solved",
+                                  "reward>=0.7", "reward>=1234567", "info:x>=0.000001"])
 def test_a_rule_reads_as_it_writes(text: str) -> None:
     assert str(Success.parse(text)) == text
 
@@ -102,12 +103,59 @@ def test_functions_are_kept_by_name_and_found_again() -> None:
     ("reward>=1", 0.1, {"success": True}, False, False),
     ("info:success", 5, {"success": False}, True, False), ("info:next.success", -3, {"is_success": True}, False, True),
     ("info:coverage>=0.95", 0, {"coverage": 0.96}, False, True), ("info:coverage>=0.95", 0, {"coverage": 0.9}, True, False),
+    ("reward>=0.7", np.float32(0.7), {}, False, True), ("info:door/open", 0, {"door": {"open": 1}}, False, True),
+    ("info:open", 0, {"open": np.array([True])}, False, True), (None, 0, {"success": None}, False, False),
     ("terminated", 0, {}, True, True), ("terminated", 1, {}, False, False), ("labels:a.csv", 1, {}, False, True),
     (None, 1, {}, False, True), (None, 0, {}, True, False), (None, -1, {"success": True}, False, True),
 ])
 def test_what_rules_say_of_an_environments_step(
         rule: str | None, reward: float, info: Any, terminated: bool, won: bool) -> None:
     assert success_of(reward, info, rule, terminated) is won
+
+
+@pytest.mark.parametrize("told", [{"task": False}, "False", np.array([True, False]), [], object()])
+def test_an_info_that_is_no_truth_value_is_no_success(told: Any) -> None:
+    """robosuite's is {"task": False}, which Python calls true."""
+    for rule in (None, "info:success", "info:success>=1"):
+        with pytest.raises(ConfigError, match=r"info 'success' is .*expected true, false or one number.*--success info:"):
+            success_of(0, {"success": told}, rule)
+
+
+@pytest.mark.parametrize("rule", ["info:solved", "labels:answers.csv", None])
+def test_a_shaped_reward_is_no_success(rule: str | None) -> None:
+    """The rule's own word is missing, and 0.3 a step does not say that the task is solved."""
+    with pytest.raises(ConfigError, match=r"the reward 0.3 and no .*in its info.*--success"):
+        success_of(0.3, {}, rule)
+
+
+def test_levels_are_those_of_single_precision() -> None:
+    """0.7 is stored as 0.69999999; the rule holds in the data as it does in the environment."""
+    made = [Episode(each.images, each.actions, np.array([0.1, 0.2, 0.3, last], np.float32))
+            for each, last in zip(episodes(), (0.7, 0.4), strict=True)]
+    assert np.flatnonzero(store("reward>=0.7", made).rewards).tolist() == [3]
+    sparse = [Episode(each.images, each.actions, np.array([0, 0, 0, last], np.float32))
+              for each, last in zip(episodes(), (123456.7, 0), strict=True)]
+    with pytest.warns(UserWarning, match="read as success"):
+        found = store(made=sparse)
+    assert success_of(np.float32(123456.7), {}, found.reading.success), "the kept rule has the level itself"
+
+
+@pytest.mark.parametrize("text", ["\ufeffepisode,success\n1,1\n", "episode;success\n1;1\n", "episode\tsuccess\n1\t1\n",
+                                  "Episode, Success, step\n0, False,\n1, True, 3.0\n"])
+def test_labels_of_spreadsheets_are_read(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "answers.csv"
+    path.write_bytes(text.encode())
+    assert np.flatnonzero(store(f"labels:{path}", episodes(infos={})).rewards).tolist() == [8]
+
+
+def test_labels_of_another_dataset_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "answers.csv"
+    path.write_text("episode,success\n0,1\n7,1\n")
+    with pytest.raises(DatasetError, match="episode 7 a success; expected numbers from 0 to 1"):
+        store(f"labels:{path}")
+    path.write_text("episode,success,step\n0,1,2.5\n")
+    with pytest.raises(DatasetError, match=r"line 2.*no whole number"):
+        store(f"labels:{path}")
 
 
 def test_rewards_below_zero_say_nothing_without_a_rule() -> None:

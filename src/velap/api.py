@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from velap.data.frames import FrameStore
     from velap.data.images import Fit
     from velap.data.success import Predicate
+    from velap.evaluation.evaluate import MakeEnv
     from velap.evaluation.summary import Summary
     from velap.methods.base import Agent
     from velap.training.loggers import Logger
@@ -44,7 +45,7 @@ Changes = Mapping[str, Mapping[str, Any]]
 
 def config_for(task: str, preset: str, changes: Changes | None) -> Config:
     """The preset's config of a task or foreign dataset with `changes` applied."""
-    return override(make_config(task, preset), **{part: dict(fields) for part, fields in (changes or {}).items()})
+    return override(make_config(task, preset), **(changes or {}))
 
 
 def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwrite: bool = False) -> str:
@@ -67,12 +68,11 @@ def make_dataset(task: str, seed: int = 0, *, workers: int | None = None, overwr
     return collect(get_task(task), seed=seed, workers=workers, overwrite=overwrite).dataset_id
 
 
-def train(source: str | Config, data: str | FrameStore | None = None, *, preset: str = "default", seed: int = 0,
-          out: Path | str | None = None, method: str = "velap", image_key: str | None = None, device: str = "auto",
-          resume: bool = False,
-          changes: Changes | None = None, fit: Fit | None = None, image_size: int = 64,
-          success: str | Predicate | None = None, mapped: bool | None = None, command: str = "velap.train",
-          loggers: Sequence[str | Logger] = ("jsonl", "tensorboard"),
+def train(source: str | Path | Config, data: str | Path | FrameStore | None = None, *, preset: str = "default",
+          seed: int = 0, out: Path | str | None = None, method: str = "velap", image_key: str | None = None,
+          device: str = "auto", resume: bool = False, changes: Changes | None = None, fit: Fit | None = None,
+          image_size: int = 64, success: str | Predicate | None = None, mapped: bool | None = None,
+          command: str = "velap.train", loggers: Sequence[str | Logger] = ("jsonl", "tensorboard"),
           on_progress: Callable[[Progress], None] = lambda progress: None) -> Path:
     """Train on a task's dataset, or on any dataset of images and continuous actions; returns the joint checkpoint.
 
@@ -108,7 +108,7 @@ def train(source: str | Config, data: str | FrameStore | None = None, *, preset:
     check_trainable(method)
     changes = dict(changes or {})
     of_head = changes.pop("head", {})
-    config, data = _asked_for(source, data, preset, changes)
+    config, data = _asked_for(_text(source), _text(data), preset, changes)
     kind = get_method(method)
     learner = kind.learner_config(config.preset, of_head) if kind.learns or of_head else None
     if isinstance(data, FrameStore):
@@ -119,7 +119,7 @@ def train(source: str | Config, data: str | FrameStore | None = None, *, preset:
     directory = Path(out) if out is not None else run_dir(config.task, config.preset, seed)
     checkpoint = directory / MODEL
     if not kind.whole_checkpoint and checkpoint.exists():
-        _check_origin(checkpoint, config, seed, changes)
+        _check_origin(checkpoint, config, seed, changes, store)
     elif not (resume and _is_finished(checkpoint, config, seed, store.content_hash)):
         run(config, store, directory, seed=seed, device=device, resume=resume, command=command, loggers=loggers,
             on_progress=on_progress)
@@ -127,6 +127,11 @@ def train(source: str | Config, data: str | FrameStore | None = None, *, preset:
         train_head(method, checkpoint, store, config=learner, device=device, command=command, loggers=loggers,
                    on_progress=on_progress)
     return checkpoint
+
+
+def _text(source: Any) -> Any:
+    """A path as the text that names a dataset; everything else as it is."""
+    return str(source) if isinstance(source, Path) else source
 
 
 def _asked_for(source: str | Config, data: str | FrameStore | None, preset: str,
@@ -137,7 +142,7 @@ def _asked_for(source: str | Config, data: str | FrameStore | None, preset: str,
         if data is None:
             raise ConfigError("got a config and no data; expected a FrameStore, or the path or id of a dataset. Call "
                               "velap.train(config, data).")
-        return override(source, **{part: dict(fields) for part, fields in changes.items()}), data
+        return override(source, **changes), data
     if data is not None:
         raise ConfigError(f"got the data {source!r} and other data beside them; expected one of them, or a config first: "
                           "velap.train(velap.make_config(...), data).")
@@ -152,8 +157,10 @@ def _refuse_with_frames(**options: Any) -> None:
                           "FrameStore.from_episodes or velap.data.loading.load_store.")
 
 
-def _check_origin(checkpoint: Path, asked_for: Config, seed: int, changes: Changes) -> None:
-    """Raises ConfigError unless a joint checkpoint comes from this task, preset and seed and has the fields of `changes`."""
+def _check_origin(checkpoint: Path, asked_for: Config, seed: int, changes: Changes, store: FrameStore) -> None:
+    """Raises ConfigError unless a joint checkpoint comes from this task, preset, seed and these frames, and has the
+    fields of `changes`."""
+    from velap.data.frames import Reading
     from velap.models.checkpoint import load_checkpoint
 
     _, config, metadata = load_checkpoint(checkpoint)
@@ -161,7 +168,12 @@ def _check_origin(checkpoint: Path, asked_for: Config, seed: int, changes: Chang
     if found != asked:
         raise ConfigError(f"{checkpoint} has task, preset and seed {found}; expected {asked}. Name its own with "
                           "--preset and --seed, or another run directory with --out.")
-    if override(config, **{part: dict(fields) for part, fields in changes.items()}) != config:
+    if metadata["dataset_hash"] != store.content_hash:
+        was, now = Reading.from_json(metadata["reading"]) if "reading" in metadata else None, store.reading
+        raise ConfigError(f"{checkpoint} learnt from the data {metadata['dataset_hash'][:12]}, read by {was}; the data are "
+                          f"{store.content_hash[:12]} now, read by {now}; expected the same: heads learn beside it. Give "
+                          "the same dataset, camera and success rule, or another run directory with --out.")
+    if override(config, **changes) != config:
         names = [f"{part}.{name}" for part, fields in changes.items() for name in fields]
         raise ConfigError(f"{checkpoint} was trained with other values of some of {', '.join(names)}; expected those "
                           "asked for. Leave them out, or train a joint model with them elsewhere with --out.")
@@ -202,8 +214,8 @@ def load(checkpoint: Path | str, method: str = "velap", device: str = "auto", he
 
 
 def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method: str = "velap", episodes: int = 100,
-             first_seed: int = 0, env: str | None = None, env_kwargs: Mapping[str, Any] | None = None,
-             image_key: str | None = None, max_steps: int | None = None, success: str | None = None,
+             first_seed: int = 0, env: str | MakeEnv | None = None, env_kwargs: Mapping[str, Any] | None = None,
+             image_key: str | None = None, max_steps: int | None = None, success: str | Predicate | None = None,
              records: Path | str = OWN_RECORDS, fresh: bool = False, batch: int = 10, device: str = "auto",
              head: Path | str | None = None, changes: Changes | None = None) -> Summary:
     """Success rate and more over seeded test episodes; goes on where an earlier call with the same records stopped.
@@ -215,11 +227,12 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
         method: a name in `velap.registry.METHODS`.
         episodes: number of episodes.
         first_seed: seed of the first one; test seeds are 0 to 99.
-        env: any Gymnasium id instead of the task's own environment.
+        env: any Gymnasium id instead of the task's own environment; with an agent, also a function that makes one.
         env_kwargs: arguments of `gymnasium.make` besides the id.
         image_key: key of the image in dict observations; None takes the checkpoint's, where the environment has it.
         max_steps: time limit where the environment has none, or a shorter one [steps].
-        success: what success is, a rule of `velap.data.success` such as `reward>=0`; None takes the checkpoint's.
+        success: what success is, a rule of `velap.data.success` such as `reward>=0`, or a function (reward, info,
+            terminated) → bool of a module; None takes the checkpoint's.
         records: root of the record files.
         fresh: move an existing record file aside first.
         batch: environments at once.
@@ -227,15 +240,21 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
         changes: fields of the checkpoint's config or of the method's own settings to replace, as in `load`.
     """
+    from velap.data.building import rule_of
     from velap.evaluation.evaluate import Evaluation, play
     from velap.evaluation.evaluate import evaluate as run
     from velap.evaluation.summary import summarise
 
     seeds = range(first_seed, first_seed + episodes)
+    rule = str(rule_of(success)) if callable(success) else success
     if not isinstance(task, str):
         return summarise(play(task, env, seeds, env_kwargs=env_kwargs, image_key=image_key, max_steps=max_steps,
-                              success=success, batch=batch))
+                              success=rule, batch=batch))
+    if not (env is None or isinstance(env, str)):
+        raise ConfigError(f"got the environment {env!r} and records to write; expected a Gymnasium id, which records name. "
+                          "Register it with gymnasium.register, or evaluate an agent: "
+                          "velap.evaluate(velap.load(checkpoint), env=make_env).")
     what = Evaluation(task, method=method, checkpoint=None if checkpoint is None else Path(checkpoint), env=env,
                       env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=max_steps,
-                      success=success, device=device, head=None if head is None else Path(head), changes=changes)
+                      success=rule, device=device, head=None if head is None else Path(head), changes=changes)
     return summarise(run(what, seeds, Path(records), fresh=fresh, batch=batch))

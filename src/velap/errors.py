@@ -21,7 +21,7 @@ class DatasetError(VelapError, ValueError):
 
 
 class ObservationError(VelapError, ValueError):
-    """Frames or an observation are not of the kind that a model was trained on."""
+    """Frames, an observation or what starts an episode are not of the kind that an agent takes."""
 
 
 class CheckpointError(VelapError, ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +14,14 @@ OWN_RECORDS, SHIPPED_RECORDS = Path("runs/records"), Path("results/records")
 """Where a user's evaluations write, and where those of the published tables lie. The two never meet."""
 
 
+def folder_name(name: str) -> str:
+    """A task, dataset or environment id as the name of one folder on every system."""
+    return re.sub(r'[/\\:*?"<>|]', "_", name)
+
+
 def run_dir(task: str, preset: str, seed: int) -> Path:
     """Default folder of a training run."""
-    return Path("runs") / task.replace("/", "_") / preset / f"seed{seed}"
+    return Path("runs") / folder_name(task) / preset / f"seed{seed}"
 
 
 @contextmanager

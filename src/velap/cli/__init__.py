@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -40,6 +41,9 @@ GREEDY = ("--set", "--only", "--env-kwargs")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 after an error that says what to do, 130 after Ctrl-C."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # π and γ are not in every code page that a log file gets
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # `--env my_module:Env-v0` finds a module beside the user, as `python -m` does
     try:

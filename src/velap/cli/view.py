@@ -31,6 +31,7 @@ def view(source: Annotated[Positional[Path], arg(help="`model.safetensors` of a 
     from velap.report.viewer import backdrop_of, subject_of, trace
     from velap.report.viewer_page import page
     from velap.runs import write_atomic
+    from velap.storage import folder_name
 
     subject = subject_of(source, episode_seed=episode_seed, checkpoint=checkpoint, method=method, env=env,
                          env_kwargs=parse_pairs(env_kwargs), max_steps=max_steps, device=device)
@@ -41,7 +42,7 @@ def view(source: Annotated[Positional[Path], arg(help="`model.safetensors` of a 
             note(f"the record says {_ended(record.success)} in {record.steps} steps, this run {_ended(now.success)} in "
                  f"{now.steps}: another machine, batch or version rounds differently")
     key = subject.player.key
-    path = out or Path("runs/view") / f"{key.task.replace('/', '_')}-{key.method}-seed{subject.seed}.html"
+    path = out or Path("runs/view") / f"{folder_name(key.task)}-{key.method}-seed{subject.seed}.html"
     text = page(subject, seen, backdrop_of(subject.player, subject.seed, dataset), projection)
     write_atomic(path, text.encode())
     say(f"{_ended(now.success)} in {now.steps} steps, {len(seen.plans)} plans")

@@ -125,7 +125,10 @@ def override(config: Config, **changes: Mapping[str, Any]) -> Config:
     parts: dict[str, Any] = {}
     for part, fields in changes.items():
         if part not in PARTS:
-            raise ConfigError(f"a config has no part {part!r}; expected some of {', '.join(PARTS)}.")
+            raise ConfigError(f"a config has no part {part!r}; expected some of {', '.join(PARTS)}, each with its fields, "
+                              "such as {'planner': {'n_iter': 500}}.")
+        if not isinstance(fields, Mapping):
+            raise ConfigError(f"`{part}` is {fields!r}; expected its fields, such as {{'planner': {{'n_iter': 500}}}}.")
         current, given = getattr(config, part), dict(fields)
         if part == "train":
             phases = current.phases

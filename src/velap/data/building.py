@@ -89,6 +89,8 @@ def build_store(name: str, episodes: Iterable[Episode], layout: ImageLayout, bou
                                                                          episode.infos, where), number, where)
         if not parts.lengths:
             raise DatasetError(f"{name} has no episode; expected at least one. Collect some data into it.")
+        if rule is not None:
+            rule.check_labels(len(parts.lengths))
         told, won = parts.successes(rule, name) if need_success else parts.any_successes(rule, name)
         rows = parts.rows()
         kept = frames.finish()

@@ -24,7 +24,7 @@ Predicate = Callable[[float, Mapping[str, Any], bool], bool]
 """(reward, info, terminated) of a transition → is it a success?"""
 INFO_KEYS = ("success", "is_success")
 """Infos by which environments tell success."""
-_TRUE, _FALSE = ("1", "true", "yes"), ("0", "false", "no", "")
+_TRUE, _FALSE = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no", "")
 _TEXT = re.compile(r"(?P<source>\w+)(:(?P<name>[^>=]+))?(>=(?P<least>[-+]?[.\d]+(e[-+]?\d+)?))?")
 _FORMS = {("reward", False, True), ("info", True, False), ("info", True, True), ("terminated", False, False),
           ("labels", True, False), ("python", True, False)}
@@ -52,7 +52,12 @@ class Success:
         return cls(found["source"], found["name"] or "", least)  # type: ignore[arg-type]
 
     def __str__(self) -> str:
-        return self.source + (f":{self.name}" if self.name else "") + ("" if self.least is None else f">={self.least:g}")
+        level = "" if self.least is None else f">={np.format_float_positional(np.float32(self.least), trim='-')}"
+        return self.source + (f":{self.name}" if self.name else "") + level
+
+    def reached(self, values: Any) -> Any:
+        """Whether numbers [*] are successes. Compared in float32, in which most data are stored: 0.7 is not below 0.7."""
+        return values.astype(bool) if self.least is None else values.astype(np.float32) >= np.float32(self.least)
 
     @cached_property
     def predicate(self) -> Predicate:
@@ -69,26 +74,37 @@ class Success:
     def labels(self) -> dict[int, int | None]:
         """Successful episodes by number and the step of their success, None for their last one, from a CSV file.
 
-        The file has a header line with `episode` and `success` (0 or 1), and maybe `step`, counted from 0.
+        The file has a header line with `episode` and `success` (0 or 1), and maybe `step`, counted from 0; separated by
+        commas, semicolons or tabs, as spreadsheets write them.
         """
         try:
-            with Path(self.name).open(newline="") as file:
-                rows = list(csv.DictReader(file))
-        except OSError as error:
+            text = Path(self.name).read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
             raise DatasetError(f"the labels {self.name} cannot be read: {error}. Expected a CSV file with the columns "
                                "episode and success; `velap label` writes one.") from error
+        header, *lines = text.splitlines() or [""]
+        separator = max(",;\t", key=header.count)
+        columns = [column.strip().lower() for column in header.split(separator)]
         found: dict[int, int | None] = {}
-        for number, row in enumerate(rows, start=2):
+        for number, row in enumerate(csv.DictReader(lines, columns, delimiter=separator, skipinitialspace=True), start=2):
             try:
                 answer = row["success"].strip().lower()
                 if answer not in (*_TRUE, *_FALSE):
                     raise ValueError(f"success is {answer!r}")
                 if answer in _TRUE:
-                    found[int(row["episode"])] = int(row["step"]) if row.get("step") else None
+                    found[_whole(row["episode"])] = _whole(row["step"]) if (row.get("step") or "").strip() else None
             except (KeyError, ValueError, AttributeError) as error:
                 raise DatasetError(f"{self.name}, line {number}: {row} is no label ({error!r}); expected the columns "
                                    "episode, success (0 or 1) and maybe step. Mend the line.") from error
         return found
+
+    def check_labels(self, episodes: int) -> None:
+        """Raises DatasetError where the labels name an episode that the dataset has not."""
+        beyond = [number for number in self.labels if not 0 <= number < episodes] if self.source == "labels" else []
+        if beyond:
+            raise DatasetError(f"{self.name} calls episode {beyond[0]} a success; expected numbers from 0 to "
+                               f"{episodes - 1}, the episodes of the dataset. Mend that line, or give the labels of this "
+                               "dataset.")
 
     def of_episode(self, number: int, rewards: np.ndarray, terminated: np.ndarray, infos: Mapping[str, np.ndarray],
                    where: str) -> np.ndarray:
@@ -103,7 +119,8 @@ class Success:
         """
         steps = len(rewards)
         if self.source == "reward":
-            return rewards >= self.least
+            won: np.ndarray = self.reached(rewards)
+            return won
         if self.source == "terminated":
             return terminated.copy()
         if self.source == "labels":
@@ -127,7 +144,16 @@ class Success:
         if values.shape != (steps,) or values.dtype.kind not in "fiub":
             raise DatasetError(f"{where}: the info {self.name} is {values.dtype} of shape {values.shape}; expected one "
                                "number a step. Name another one with --success info:NAME.")
-        return values.astype(bool) if self.least is None else values >= self.least
+        won = self.reached(values)
+        return won
+
+
+def _whole(text: str) -> int:
+    """An integer, also as a table with empty cells writes it: `20.0`."""
+    value = float(text)
+    if not value.is_integer():
+        raise ValueError(f"{text} is no whole number")
+    return int(value)
 
 
 def last_entries(values: np.ndarray, steps: int) -> np.ndarray:
@@ -136,28 +162,47 @@ def last_entries(values: np.ndarray, steps: int) -> np.ndarray:
     return values[len(values) - steps :]
 
 
-def success_of(reward: float, info: Mapping[str, Any], rule: Success | str | None = None, terminated: bool = False) -> bool:
+def success_of(reward: float, info: Mapping[str, Any], rule: Success | str | None = None,
+               terminated: bool = False) -> bool:
     """Is a transition of an environment a success, by the rule that its checkpoint keeps?
 
     Without a rule, and for rules that an environment cannot follow (labels; an info that it does not give): what its info
-    says under `success` or `is_success`, else a positive reward. Raises ConfigError for a negative reward without either:
-    where every step costs, 0 may well be success.
+    says under `success` or `is_success`, else a reward of 1. Raises ConfigError for other rewards than 0 and 1 without
+    either: where every step costs or pays, they do not tell success.
     """
     rule = Success.parse(rule) if isinstance(rule, str) else rule
     if rule is not None and rule.source == "reward":
-        assert rule.least is not None
-        return reward >= rule.least
+        return bool(rule.reached(np.asarray(reward)))
     if rule is not None and rule.source == "terminated":
         return terminated
     if rule is not None and rule.source == "python":
         return bool(rule.predicate(reward, info, terminated))
-    if rule is not None and rule.source == "info" and rule.name in info:
-        return bool(info[rule.name]) if rule.least is None else bool(info[rule.name] >= rule.least)
-    for key in INFO_KEYS:
-        if key in info:
-            return bool(info[key])
-    if reward < 0:
-        raise ConfigError(f"the environment gave the reward {reward:g} and no `success` in its info; expected 0, or a "
-                          "positive reward for success. Say what success is, such as --success 'reward>=0' for an "
+    rules = [rule] if rule is not None and rule.source == "info" else []
+    for asked in (*rules, *(Success("info", key) for key in INFO_KEYS)):
+        told = _entry(info, asked.name)
+        if told is not None:
+            return _told(asked, told)
+    if reward not in (0, 1):
+        missing = "`success`" if rule is None or rule.source != "info" else f"{rule.name!r}"
+        raise ConfigError(f"the environment gave the reward {reward:g} and no {missing} in its info; expected the rewards 0 "
+                          "and 1, of which 1 is success. Say what success is, such as --success 'reward>=0' for an "
                           "environment that gives -1 a step and 0 at the goal.")
-    return reward > 0
+    return reward == 1
+
+
+def _entry(info: Any, name: str) -> Any:
+    """The info of that name, `a/b` where infos are nested, as readers call it; None where there is none."""
+    if name in info:
+        return info[name]
+    head, _, rest = name.partition("/")
+    return _entry(info[head], rest) if rest and isinstance(info.get(head), Mapping) else None
+
+
+def _told(rule: Success, value: Any) -> bool:
+    """Whether an environment's info is a success; raises ConfigError unless it is one number or truth value."""
+    told = np.asarray(value)
+    if told.size != 1 or told.dtype.kind not in "fiub":
+        inner = f"{rule.name}/{next(iter(value))}" if isinstance(value, Mapping) and value else "NAME"
+        raise ConfigError(f"the environment's info {rule.name!r} is {str(value)[:80]!r}; expected true, false or one "
+                          f"number. Name another info by --success info:{inner}.")
+    return bool(rule.reached(told))

@@ -28,6 +28,8 @@ from velap.models.checkpoint import WEIGHTS_SHA256, load_checkpoint, released_ch
 from velap.models.velap import LatentModel
 from velap.tasks import TASKS, get_task, make_config
 
+MakeEnv = Callable[..., gym.Env[Any, Any]]
+"""A function of the keyword arguments `env_kwargs` that makes an environment."""
 BATCH = 10
 """Environments that run at once. ours: plans are batched over them, more only cost memory."""
 
@@ -183,7 +185,7 @@ def load_method(what: Evaluation) -> LoadedMethod:
                           f"{released}, or train one with `velap train {what.task}`.")
     device = pick_device(what.device)
     model, config, metadata = load_checkpoint(what.checkpoint, device)
-    changes = {part: dict(fields) for part, fields in (what.changes or {}).items()}
+    changes = dict(what.changes or {})
     settings = method.settings_of(config.preset, changes.pop(what.method, None))
     head = None
     if method.learns:
@@ -194,12 +196,18 @@ def load_method(what: Evaluation) -> LoadedMethod:
     return LoadedMethod(model, override(config, **changes), seed, digest, head, settings, reading)
 
 
-def make_env(env_id: str, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, Any]:
-    """The Gymnasium environment of that id, in the render mode `rgb_array` if it has one.
+def make_env(env_id: str | MakeEnv, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, Any]:
+    """The Gymnasium environment of that id, in the render mode `rgb_array` if it has one; or what the function makes.
 
     Raises UnknownTaskError when Gymnasium cannot make it, ConfigError when it refuses its arguments.
     """
     kwargs = dict(kwargs or {})
+    if not isinstance(env_id, str):
+        made = env_id(**kwargs) if callable(env_id) else env_id
+        if not callable(env_id) or not isinstance(made, gym.Env):
+            raise ConfigError(f"got the environment {made!r}; expected a Gymnasium id, or a function that makes a new "
+                              "environment at each call, such as `lambda: MyEnv()`.")
+        return made
     try:
         env = gym.make(env_id, **kwargs)
         if env.render_mode is None and "rgb_array" in env.metadata.get("render_modes", ()) and "render_mode" not in kwargs:
@@ -260,14 +268,14 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
         return select(file.records, seeds)
 
 
-def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str, Any] | None = None,
+def play(agent: Agent, env: str | MakeEnv | None, seeds: range, *, env_kwargs: Mapping[str, Any] | None = None,
          image_key: str | None = None, max_steps: int | None = None, success: str | None = None,
          image_size: int = IMAGE_SIZE, batch: int = BATCH) -> list[Record]:
     """Run an agent's episodes and return their records, one a seed, without writing them.
 
     Args:
         agent: anything that acts as `velap.methods.base.Agent` does.
-        env: task name, or any Gymnasium id.
+        env: task name, any Gymnasium id, or a function that makes an environment.
         seeds: episode seeds; test seeds are 0 to 99.
         env_kwargs: arguments of `gymnasium.make` besides the id.
         image_key: key of the image in dict observations.
@@ -281,16 +289,17 @@ def play(agent: Agent, env: str | None, seeds: range, *, env_kwargs: Mapping[str
                           'velap.evaluate(agent, env="SpiralMaze").')
     if len(seeds) == 0 or batch < 1:
         raise ConfigError(f"got {len(seeds)} episodes in batches of {batch}; expected at least one of each.")
-    env_id = TASKS[env].env_id if env in TASKS else env
+    env_id = TASKS[env].env_id if isinstance(env, str) and env in TASKS else env
+    name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
     first = make_env(env_id, env_kwargs)
     try:
         limit = _time_limit(first, max_steps)
     finally:
         first.close()
-    key = RunKey(task=env, method=agent.method, preset="none", train_seed=0, env=env_id, config_hash="", checkpoint="",
+    key = RunKey(task=name, method=agent.method, preset="none", train_seed=0, env=name, config_hash="", checkpoint="",
                  code_version=code_version(), env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=limit,
                  success_rule=success)
-    player = Player(agent=agent, model=None, config=Config(task=env, preset="none"), key=key, image_size=image_size,
+    player = Player(agent=agent, model=None, config=Config(task=name, preset="none"), key=key, image_size=image_size,
                     make_env=lambda: make_env(env_id, env_kwargs))
     return [to_record(key, each, min(batch, len(seeds)), device="")
             for each in sorted(player.episodes(seeds, batch), key=lambda each: each.seed)]

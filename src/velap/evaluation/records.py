@@ -20,7 +20,7 @@ from typing import Any, Self
 
 from velap.errors import RecordError
 from velap.runs import storage_errors
-from velap.storage import locked
+from velap.storage import folder_name, locked
 from velap.tasks import TASKS
 
 SCHEMA = 2
@@ -35,8 +35,7 @@ _NEW_IN_2: dict[str, Any] = {"env_kwargs": {}, "image_key": None, "success_rule"
 
 def record_path(root: Path, task: str, method: str, preset: str, train_seed: int) -> Path:
     """`<root>/<task>/<method>-<preset>/train<seed>.jsonl`."""
-    folder = task.replace("/", "_").replace(":", "_")
-    return root / folder / f"{method}-{preset}" / f"train{train_seed}.jsonl"
+    return root / folder_name(task) / f"{method}-{preset}" / f"train{train_seed}.jsonl"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,12 +70,12 @@ class FrameReader:
         self._side, self._fit = side, fit
 
     def __call__(self, observation: Any) -> NDArray[np.uint8]:
-        """The image of one observation."""
+        """The image of one observation, a copy: environments may write the next one into the same memory."""
         image = self._layout.of(observation)
         if image.dtype != self._layout.dtype or image.shape != self._layout.shape:
             raise ConfigError(f"{self._name} returned {image.dtype}{list(image.shape)}; its observation space promises "
                               f"{self._layout.dtype}{list(self._layout.shape)}. Mend the environment.")
-        return to_rgb(image[None], self._layout, self._side, self._fit)[0]
+        return to_rgb(image[None], self._layout, self._side, self._fit)[0].copy()
 
 
 @dataclass
@@ -143,7 +143,8 @@ class Rollout:
         for index, row in enumerate(rows):
             if row is None and queue:
                 seed = queue.popleft()
-                observation, _ = self._envs[index].reset(seed=seed, options=self._options)
+                options = {} if self._options is None else {"options": self._options}  # not every environment takes some
+                observation, _ = self._envs[index].reset(seed=seed, **options)
                 rows[index] = _Running(seed, [self._read(observation)])
                 mask[index], seeds[index] = True, seed
         if mask.any():
@@ -158,7 +159,7 @@ class Rollout:
             self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent, frame=row.frames[-1]))
         observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
         row.frames.append(self._read(observation))
-        success = success_of(float(reward), info, self._success, bool(terminated))
+        success = success_of(_number(reward), info, self._success, bool(terminated))
         out_of_time = truncated or (self._max_steps is not None and row.steps >= self._max_steps)
         if not (success or terminated or out_of_time):
             return None
@@ -168,6 +169,14 @@ class Rollout:
             self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent, frame=row.frames[-1],
                                   outcome=outcome))
         return outcome
+
+
+def _number(reward: Any) -> float:
+    """An environment's reward, also where it is an array of one entry."""
+    value = np.asarray(reward)
+    if value.size != 1 or value.dtype.kind not in "fiub":
+        raise ConfigError(f"the environment gave the reward {str(reward)[:80]}; expected one number. Mend its `step`.")
+    return float(value.item())
 
 
 def make_envs(make: Callable[[], gym.Env[Any, Any]], count: int) -> list[gym.Env[Any, Any]]:

@@ -173,7 +173,7 @@ def summarise_all(root: Path) -> list[Summary]:
 
 def write_into(document: Path, table: str) -> None:
     """Replace the text between the two table marks of `document`."""
-    text = document.read_text() if document.is_file() else ""
+    text = document.read_text(encoding="utf-8") if document.is_file() else ""
     if text.count(TABLE_START) != 1 or text.count(TABLE_END) != 1:
         raise RecordError(f"{document} has no place for the table; put the lines {TABLE_START!r} and {TABLE_END!r} where it "
                           "belongs.")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from velap.errors import ConfigError, UnknownTaskError
+from velap.errors import ConfigError, ObservationError, UnknownTaskError
 from velap.registry import METHODS
 
 if TYPE_CHECKING:
@@ -38,7 +38,8 @@ class Agent(Protocol):
     """[B] planning time of the last `act` [ms], NaN in rows that did not plan."""
 
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
-        """Start new episodes where `mask` [B] is set, with randomness from `seeds` [B] alone; None takes the row numbers."""
+        """Start new episodes where `mask` bool [B] is set, with randomness from `seeds` int [B] alone; None takes the row
+        numbers."""
         ...
 
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -207,7 +208,17 @@ def make_agent(method: str, model: LatentModel | None, config: Config, action_sp
     return kind.agent(Parts(model, config, action_space, settings, head))  # type: ignore[arg-type]  # None where not needed
 
 
-def masked_seeds(mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None) -> list[tuple[int, int]]:
-    """(row, seed) of every row set in `mask` [B]."""
-    rows = np.flatnonzero(mask)
-    return [(int(row), int(row if seeds is None else seeds[row])) for row in rows]
+def checked_starts(mask: Any, seeds: Any) -> tuple[NDArray[np.bool_], list[tuple[int, int]]]:
+    """What `Agent.reset` was given: the mask bool [B], and (row, seed) of every row that is set in it.
+
+    Raises ObservationError for other masks, such as numbers of rows, and for seeds that are not one integer a row.
+    """
+    started = np.array(mask)
+    if started.dtype != np.bool_ or started.ndim != 1 or len(started) == 0:
+        raise ObservationError(f"reset got a mask of type {started.dtype} and shape {list(started.shape)}; expected bool "
+                               "[B], true in the rows where an episode begins. For all of B rows give np.ones(B, bool).")
+    given = np.arange(len(started)) if seeds is None else np.asarray(seeds)
+    if given.shape != started.shape or given.dtype.kind not in "iu" or (given < 0).any():
+        raise ObservationError(f"reset got seeds of type {given.dtype} and shape {list(given.shape)}; expected an integer "
+                               f"of 0 or more for each of the {len(started)} rows. Rows that go on ignore theirs.")
+    return started, [(int(row), int(given[row])) for row in np.flatnonzero(started)]

@@ -18,7 +18,7 @@ from velap._version import __version__
 from velap.config import Config, ModelConfig
 from velap.errors import CheckpointError
 from velap.methods.base import get_method, learning_methods
-from velap.models.checkpoint import WEIGHTS_SHA256, restore, shared_weights
+from velap.models.checkpoint import WEIGHTS_SHA256, find_checkpoint, restore, shared_weights
 from velap.models.encoders.base import latent_width
 from velap.models.networks import POLICY, Policy
 from velap.registry import METHODS
@@ -62,7 +62,7 @@ HEAD_FORMAT = "velap-head/1"
 
 def head_path(checkpoint: Path | str, method: str) -> Path:
     """Where the head of a method lies: beside the joint checkpoint."""
-    return Path(checkpoint).with_name(f"{method}.safetensors")
+    return find_checkpoint(checkpoint).with_name(f"{method}.safetensors")
 
 
 def make_head(method: str, config: ModelConfig, action_dim: int) -> Head:

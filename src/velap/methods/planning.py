@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from velap.methods.base import masked_seeds
+from velap.methods.base import checked_starts
 from velap.methods.states import StateEncoder
 
 if TYPE_CHECKING:
@@ -41,13 +41,14 @@ class PlanningAgent(ABC):
     @torch.inference_mode()
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
         """Forget the plans where `mask` [B] is set and seed those rows anew."""
+        mask, starts = checked_starts(mask, seeds)
         if len(self._generators) != len(mask):
             self._generators = [torch.Generator().manual_seed(row) for row in range(len(mask))]
             self._age = np.full(len(mask), self._period)
             self.last_plan_ms = np.full(len(mask), np.nan)
             self._allocate(len(mask))
         self._states.forget(mask)
-        for row, seed in masked_seeds(mask, seeds):
+        for row, seed in starts:
             self._generators[row].manual_seed(seed)
             self._forget(row)
         self._age[mask] = self._period

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap.errors import ConfigError
-from velap.methods.base import Agent, Method, Parts, masked_seeds
+from velap.methods.base import Agent, Method, Parts, checked_starts
 from velap.methods.states import checked_frames
 from velap.registry import register_method
 
@@ -37,10 +37,11 @@ class RandomAgent:
 
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
         """New generators where `mask` [B] is set."""
+        mask, starts = checked_starts(mask, seeds)
         if len(self._generators) != len(mask):
             self._generators = [np.random.default_rng(row) for row in range(len(mask))]
             self.last_plan_ms = np.full(len(mask), np.nan)
-        for row, seed in masked_seeds(mask, seeds):
+        for row, seed in starts:
             self._generators[row] = np.random.default_rng(seed)
 
     def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from velap.methods.base import checked_starts
 from velap.methods.states import StateEncoder
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ class ReactiveAgent:
 
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
         """Forget the actions taken, where the state holds them: the policy is a function of the state."""
+        mask, _ = checked_starts(mask, seeds)
         self._states.forget(mask)
         self.last_plan_ms = np.full(len(mask), np.nan)
 

@@ -26,7 +26,7 @@ def checked_frames(frames: Any, stack: int, size: tuple[int, int] | None = None)
     instance floats in [0, 1], and give another action.
 
     Args:
-        frames: what `act` was given; a view of any strides is copied.
+        frames: what `act` was given; a view of any strides, and what is read-only, is copied.
         stack: N, frames a state [frames].
         size: H and W [px]; None takes any.
     """
@@ -39,7 +39,7 @@ def checked_frames(frames: Any, stack: int, size: tuple[int, int] | None = None)
     state = (stack, *(size or given.shape[2:4]), 3)
     if len(given.shape) != 5 or len(given) == 0 or given.shape[1:] != state:
         raise ObservationError(f"{got}. {_shape_hint(given.shape, state)}")
-    return np.ascontiguousarray(given)
+    return np.require(given, requirements=("C", "W"))
 
 
 def _type_hint(given: NDArray[Any]) -> str:

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from velap.methods.base import masked_seeds
+from velap.methods.base import checked_starts
 from velap.methods.lookahead import local_policy_of
 from velap.methods.states import StateEncoder
 from velap.methods.waypoints import Plans
@@ -93,10 +93,11 @@ class TreeAgent(ABC):
     @torch.inference_mode()
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64] | None = None) -> None:
         """Forget the plans where `mask` [B] is set and seed those rows anew."""
+        mask, starts = checked_starts(mask, seeds)
         if len(self._generators) != len(mask):
             self._generators = [torch.Generator().manual_seed(row) for row in range(len(mask))]
             self._allocate(len(mask))
-        for row, seed in masked_seeds(mask, seeds):
+        for row, seed in starts:
             self._generators[row].manual_seed(seed)
         self._states.forget(mask)
         started = torch.from_numpy(mask).to(self._device)

@@ -69,8 +69,12 @@ def save_checkpoint(path: Path, model: LatentModel, config: Config, provenance: 
 
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tuple[LatentModel, Config, dict[str, str]]:
-    """Model in eval mode, its config and the metadata; raises CheckpointError on anything but an intact velap model."""
-    tensors, metadata = load_tensors(Path(path))
+    """Model in eval mode, its config and the metadata, of a file, a run directory or a repository of the Hugging Face hub.
+
+    Raises CheckpointError on anything but an intact velap model.
+    """
+    path = find_checkpoint(path)
+    tensors, metadata = load_tensors(path)
     if metadata.get("format") != MODEL_FORMAT:
         raise CheckpointError(
             f"{path} has format {metadata.get('format')!r}; expected {MODEL_FORMAT!r}. "
@@ -87,7 +91,7 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tup
 def find_checkpoint(place: Path | str) -> Path:
     """The checkpoint file that a path, a folder or an id of the Hugging Face hub names; raises CheckpointError."""
     path = Path(place)
-    if path.exists() or str(place).count("/") != 1 or path.suffix:
+    if path.exists() or path.as_posix().count("/") != 1 or path.suffix:
         return path / MODEL if path.is_dir() else path
     try:
         from huggingface_hub import hf_hub_download  # type: ignore[import-not-found]

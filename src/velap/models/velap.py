@@ -204,9 +204,9 @@ class LatentModel(nn.Module):
     def from_pretrained(cls, place: Path | str, device: torch.device | str = "cpu") -> LatentModel:
         """The model of a checkpoint in eval mode: a file, a folder with `model.safetensors`, or the id of a repository on
         the Hugging Face hub (`user/name`; needs the package huggingface-hub). `origin` keeps its config and provenance."""
-        from velap.models.checkpoint import find_checkpoint, load_checkpoint
+        from velap.models.checkpoint import load_checkpoint
 
-        model, config, metadata = load_checkpoint(find_checkpoint(place), device)
+        model, config, metadata = load_checkpoint(place, device)
         model.origin = Origin(config, metadata)
         return model
 

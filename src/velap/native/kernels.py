@@ -87,7 +87,7 @@ def _build(compiler: str) -> Path:
 def _processor() -> str:
     """What `-march=native` depends on: a cache may be shared between machines."""
     cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else []
     named = [line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))]
     return "\n".join([platform.machine(), platform.processor(), *sorted(set(named))])
 

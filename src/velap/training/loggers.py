@@ -36,7 +36,7 @@ class JsonLines:
     def log(self, step: int, phase: str, seconds: float, values: Mapping[str, float]) -> None:
         """Adds one line."""
         row = {"step": step, "phase": phase, "seconds": round(seconds, 1), **values}
-        with storage_errors(self.path), open(self.path, "a") as file:
+        with storage_errors(self.path), open(self.path, "a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
     def close(self) -> None:

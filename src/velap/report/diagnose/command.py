@@ -39,6 +39,7 @@ from velap.report.diagnose.text import checks, page
 from velap.report.diagnose.world import Scene, expert_curves, first_states, has_layout, look_at_scene
 from velap.report.figures import RealStates, can_probe, probe, strip_figure
 from velap.runs import only_writer, write_atomic
+from velap.storage import folder_name
 from velap.tasks import TASKS, get_task, task_of
 from velap.training.diagnostics import horizons
 from velap.training.loop import pick_device
@@ -167,7 +168,7 @@ def run_diagnose(console: Console, request: Request) -> Diagnosis:
     player = None if subject.evaluation is None else load_player(subject.evaluation)
     with console.status(f"reading {subject.dataset_id}"):
         recorded = open_recorded(subject.dataset_id, request.image_key, model, config, metadata, request.success)
-    out = request.out or Path("runs/diagnosis") / subject.name.replace("/", "_")
+    out = request.out or Path("runs/diagnosis") / folder_name(subject.name)
     with only_writer(out, "a diagnosis"):
         diagnosis = _measure(console, request, subject, model, config, recorded, player)
         with console.status("drawing"):
