@@ -150,10 +150,11 @@ def test_train_has_every_option_of_python(monkeypatch: pytest.MonkeyPatch) -> No
 
     offered = set(inspect.signature(velap.train).parameters)
     monkeypatch.setattr("velap.api.train", trained)
-    typed = ["--dataset", "robot/pile-v0", "--image-key", "camera", "--preset", "paper", "--seed", "7", "--out", "elsewhere",
+    typed = ["--dataset", "robot/pile-v0", "--image-key", "front", "--image-key", "wrist", "--preset", "paper",
+             "--seed", "7", "--out", "elsewhere",
              "--device", "cpu", "--resume", "--set", "train.c0=2", "--method", "td3bc", "--success", "terminated",
              "--fit", "pad", "--image-size", "96", "--mapped"]
-    given = {"source": "robot/pile-v0", "image_key": "camera", "preset": "paper", "seed": 7, "out": Path("elsewhere"),
+    given = {"source": "robot/pile-v0", "image_key": "front,wrist", "preset": "paper", "seed": 7, "out": Path("elsewhere"),
              "device": "cpu", "resume": True, "changes": {"train": {"c0": 2}}, "method": "td3bc", "success": "terminated",
              "fit": "pad", "image_size": 96, "mapped": True}
     for loggers in ((), ("jsonl",), ("tensorboard", "wandb")):

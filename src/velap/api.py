@@ -86,7 +86,7 @@ def train(source: str | Path | Config, data: str | Path | FrameStore | None = No
         seed: decides weights and batches.
         out: run directory; None takes `runs/<task>/<preset>/seed<seed>`.
         method: a name in `velap.registry.METHODS`.
-        image_key: key of the image in dict observations.
+        image_key: key of the image in dict observations; `a,b` puts two cameras side by side.
         fit: how oblong images become square: `crop`, `pad` or `squash`.
         image_size: side that images are resized to [px].
         success: what success is, a rule of `velap.data.success`; None finds one.
@@ -229,7 +229,8 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
         first_seed: seed of the first one; test seeds are 0 to 99.
         env: any Gymnasium id instead of the task's own environment; with an agent, also a function that makes one.
         env_kwargs: arguments of `gymnasium.make` besides the id.
-        image_key: key of the image in dict observations; None takes the checkpoint's, where the environment has it.
+        image_key: key of the image in dict observations, `a,b` of two cameras; None takes the checkpoint's, where the
+            environment has it.
         max_steps: time limit where the environment has none, or a shorter one [steps].
         success: what success is, a rule of `velap.data.success` such as `reward>=0`, or a function (reward, info,
             terminated) → bool of a module; None takes the checkpoint's.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from velap.cli.options import OUT, Device, Method, Preset, Records, Settings, Task, command, say
+from velap.cli.options import OUT, Device, ImageKey, Method, Preset, Records, Settings, Task, command, joined, say
 from velap.cli.settings import parse_pairs, parse_settings
 from velap.storage import OWN_RECORDS
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap", episodes: int = 100, first_seed: int = 0,
-             env: str | None = None, env_kwargs: tuple[str, ...] = (), image_key: str | None = None,
+             env: str | None = None, env_kwargs: tuple[str, ...] = (), image_key: ImageKey = (),
              max_steps: int | None = None, success: str | None = None, preset: Preset = "default",
              records: Records = OWN_RECORDS, fresh: bool = False, batch: int = 10, video: bool = False,
              device: Device = "auto", settings: Settings = (), head: Path | None = None) -> None:
@@ -28,7 +28,6 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
         first_seed: Seed of the first one; test seeds are 0 to 99.
         env: Any Gymnasium id, `module:Env-v0` included, instead of the task's own; TASK is then any label.
         env_kwargs: Arguments of the environment, such as `obs_type=pixels`.
-        image_key: Key of the image in dict observations.
         max_steps: Time limit where the environment has none, or a shorter one.
         success: What counts as success, such as `reward>=0`, `info:success` or `terminated`. Default: the rule that the
             checkpoint keeps.
@@ -42,7 +41,7 @@ def evaluate(task: Task, checkpoint: Path | None = None, method: Method = "velap
 
     changes = parse_settings(settings, {method: get_method(method).settings})
     what = Evaluation(task, method=method, checkpoint=checkpoint, preset=preset, env=env, env_kwargs=parse_pairs(env_kwargs),
-                      image_key=image_key, max_steps=max_steps, success=success, device=device,
+                      image_key=joined(image_key), max_steps=max_steps, success=success, device=device,
                       changes=changes, head=head)
     evaluate_with_progress(what, range(first_seed, first_seed + episodes), records, fresh=fresh, batch=batch, video=video)
 
@@ -84,7 +83,7 @@ def demo(task: Positional[str] = "SpiralMaze", checkpoint: Path | None = None, e
 
 def diagnose(task: Positional[str | None] = None, checkpoint: Path | None = None, dataset: str | None = None,
              out: Path | None = None, episodes: int = 10, first_seed: int = 1000, env: str | None = None,
-             env_kwargs: tuple[str, ...] = (), image_key: str | None = None, max_steps: int | None = None,
+             env_kwargs: tuple[str, ...] = (), image_key: ImageKey = (), max_steps: int | None = None,
              success: str | None = None, device: Device = "auto", settings: Settings = ()) -> None:
     """Look into a trained model and its plans, and at where its episodes fail; writes pictures and a page of text.
 
@@ -97,7 +96,6 @@ def diagnose(task: Positional[str | None] = None, checkpoint: Path | None = None
         first_seed: Seed of the first one; seeds 0 to 99 are the test episodes and refused.
         env: Any Gymnasium id instead of the task's own.
         env_kwargs: Arguments of the environment, such as `obs_type=pixels`.
-        image_key: Key of the image in dict observations.
         max_steps: Time limit where the environment has none, or a shorter one.
         success: What counts as success, such as `reward>=0`. Default: the rule that the checkpoint keeps.
     """
@@ -105,5 +103,5 @@ def diagnose(task: Positional[str | None] = None, checkpoint: Path | None = None
 
     run_diagnose(OUT, Request(task=task, checkpoint=checkpoint, dataset=dataset, out=out, episodes=episodes,
                               first_seed=first_seed, device=device, changes=parse_settings(settings), env=env,
-                              env_kwargs=parse_pairs(env_kwargs), image_key=image_key, max_steps=max_steps,
+                              env_kwargs=parse_pairs(env_kwargs), image_key=joined(image_key), max_steps=max_steps,
                               success=success, command=command()))

@@ -8,19 +8,18 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from velap.cli.options import note, say
+from velap.cli.options import ImageKey, joined, note, say
 from velap.errors import ConfigError
 
 Dataset = Annotated[Positional[str], arg(help="Path of a dataset, or its Minari or LeRobot id.")]
 Fit = Literal["crop", "pad", "squash"]
 
 
-def inspect(dataset: Dataset, image_key: str | None = None, success: str | None = None, fit: Fit | None = None,
+def inspect(dataset: Dataset, image_key: ImageKey = (), success: str | None = None, fit: Fit | None = None,
             image_size: int = 64, mapped: bool = False, out: Path | None = None) -> None:
     """Say what is in a dataset and what will not work with it; writes a page, its figures as JSON, and pictures.
 
     Args:
-        image_key: Key of the image in dict observations.
         success: Rule of success, such as `info:solved`, `terminated` or `labels:answers.csv`.
         fit: How oblong images become square.
         image_size: Side that images are resized to [px].
@@ -30,7 +29,7 @@ def inspect(dataset: Dataset, image_key: str | None = None, success: str | None 
     from velap.report.inspect import inspect as run
     from velap.report.inspect import inspection_text, save_inspection
 
-    found = run(dataset, image_key=image_key, image_size=image_size, fit=fit, success=success,
+    found = run(dataset, image_key=joined(image_key), image_size=image_size, fit=fit, success=success,
                 mapped=mapped or None)
     folder = out or Path("runs/inspection") / Path(dataset).name
     say(inspection_text(found))
@@ -38,7 +37,7 @@ def inspect(dataset: Dataset, image_key: str | None = None, success: str | None 
         say(f"written {path}")
 
 
-def label(dataset: Dataset, out: Path = Path("labels.csv"), successes: str | None = None, image_key: str | None = None,
+def label(dataset: Dataset, out: Path = Path("labels.csv"), successes: str | None = None, image_key: ImageKey = (),
           fit: Fit | None = None) -> None:
     """Show the last frames of all episodes and write which ones succeed, for `--success labels:FILE.csv`.
 
@@ -48,13 +47,12 @@ def label(dataset: Dataset, out: Path = Path("labels.csv"), successes: str | Non
     Args:
         out: The CSV file.
         successes: The answers, instead of standard input.
-        image_key: Key of the image in dict observations.
         fit: How oblong images become square.
     """
     from velap.data.labels import draw_sheets, never, parse_answers, write_labels
     from velap.data.loading import load_store
 
-    store = load_store(dataset, image_key, fit=fit, success=never, need_success=False)
+    store = load_store(dataset, joined(image_key), fit=fit, success=never, need_success=False)
     answers = None if successes is None else parse_answers(successes, store)
     for path in draw_sheets(store, out.parent, out.stem):
         say(f"last frames {path}")

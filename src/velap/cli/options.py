@@ -22,7 +22,15 @@ Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="`auto`: CUDA if the
 Settings = Annotated[tuple[tuple[str, ...], ...], UseAppendAction,
                      arg(name="set", help="Config fields to replace, such as `planner.n_iter=500`.")]
 """One tuple for each `--set` of the command line."""
+ImageKey = Annotated[tuple[str, ...], UseAppendAction,
+                     arg(metavar="KEY", help="Key of the image in dict observations, `a/b` when nested. Give it once "
+                                             "for each camera: several stand side by side in one frame.")]
 Records = Annotated[Path, arg(help="Root of the episode records.")]
+
+
+def joined(image_key: tuple[str, ...]) -> str | None:
+    """The keys of `--image-key` as the Python interface takes them: `a,b`."""
+    return ",".join(image_key) or None
 
 
 def command() -> str:

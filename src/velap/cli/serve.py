@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from velap.cli.options import ImageKey, joined
 from velap.errors import ConfigError
 
 Checkpoint = Annotated[Positional[Path], arg(help="`model.safetensors` of a run.")]
@@ -17,7 +18,7 @@ KEY = "VELAP_API_KEY"
 
 
 def serve(checkpoint: Checkpoint, method: str = "velap", host: str = "127.0.0.1", port: int = 8000,
-          image_key: str | None = None, device: Device = "auto", head: Path | None = None) -> None:
+          image_key: ImageKey = (), device: Device = "auto", head: Path | None = None) -> None:
     """Serve a checkpoint to robots by openpi's websocket protocol, for `openpi-client`; see docs/how-to/real-robot.md.
 
     Clients send the key that the environment variable VELAP_API_KEY holds here.
@@ -26,7 +27,6 @@ def serve(checkpoint: Checkpoint, method: str = "velap", host: str = "127.0.0.1"
         method: VELAP or another method of `velap evaluate`.
         host: Address to listen on; one that other machines reach needs a key.
         port: Port to listen on.
-        image_key: Key of the camera's picture in observations, `a/b` when nested. Default: the only picture.
         head: What the method learnt. Default: METHOD.safetensors beside the checkpoint.
     """
     import asyncio
@@ -42,7 +42,7 @@ def serve(checkpoint: Checkpoint, method: str = "velap", host: str = "127.0.0.1"
 
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     policy = load_policy(checkpoint, method, device, head)
-    server = Server(policy, host=host, port=port, api_key=os.environ.get(KEY), image_key=image_key)
+    server = Server(policy, host=host, port=port, api_key=os.environ.get(KEY), image_key=joined(image_key))
     keyed = "clients need the key" if KEY in os.environ else f"without a key: {KEY} is not set"
     asyncio.run(server.run(lambda at: OUT.print(
         f"serving {checkpoint} ({method}) on ws://{host}:{at}, {keyed}; Ctrl-C ends it", markup=False, soft_wrap=True)))

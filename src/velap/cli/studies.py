@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from velap.cli.options import OUT, Device, Settings, say
+from velap.cli.options import OUT, Device, ImageKey, Settings, joined, say
 from velap.cli.settings import parse_settings
 from velap.errors import ConfigError
 from velap.storage import OWN_RECORDS, SHIPPED_RECORDS
@@ -98,7 +98,7 @@ def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-wid
                            arg(help="Number of the paper's figure, or a picture of the documentation.")],
            task: Annotated[Positional[str | None], arg(help="Of figure 3; by default both mazes.")] = None,
            write: Path | None = None, checkpoint: Path | None = None, dataset: str | None = None,
-           image_key: str | None = None, device: Device = "auto", episodes: int = 50, no_run: bool = False,
+           image_key: ImageKey = (), device: Device = "auto", episodes: int = 50, no_run: bool = False,
            fresh: bool = False) -> None:
     """Make a figure of the paper, or draw a picture of the documentation anew.
 
@@ -112,7 +112,6 @@ def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-wid
         checkpoint: Figures 3, 7, 8: `model.safetensors` of a run. Default: the released one.
         dataset: Figure 3: states of this dataset instead of those of an environment seen from above; panels a and c stay
             empty.
-        image_key: Figure 3: key of the image in dict observations.
         device: Figure 3: where the networks run.
         episodes: Figures 7 and 8: episodes a point, seeds from 1000.
         no_run: Only draw what was made before.
@@ -121,7 +120,7 @@ def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-wid
     if name == "3":
         from velap.report.latent_figure import show
 
-        show(OUT, task, checkpoint=checkpoint, dataset=dataset, image_key=image_key, device=device, no_run=no_run,
+        show(OUT, task, checkpoint=checkpoint, dataset=dataset, image_key=joined(image_key), device=device, no_run=no_run,
              write=write)
         return
     if task is not None:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from velap.cli.options import OUT, Device, Method, Preset, Records, Settings, Task, command, note, say
+from velap.cli.options import OUT, Device, ImageKey, Method, Preset, Records, Settings, Task, command, joined, note, say
 from velap.cli.settings import parse_settings
 from velap.errors import ConfigError
 from velap.storage import OWN_RECORDS
@@ -37,7 +37,7 @@ def collect(task: Task, seed: int = 0, workers: int | None = None, dataset_id: s
     say(f"dataset {result.dataset_id} in {result.path}, {result.seconds:.0f} s\ncontent hash {result.content_hash}")
 
 
-def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: str | None = None,
+def train(task: Positional[str | None] = None, dataset: str | None = None, image_key: ImageKey = (),
           preset: Preset = "default", seed: int = 0, out: Path | None = None, device: Device = "auto", resume: bool = False,
           settings: Settings = (), method: Method = "velap", success: str | None = None,
           fit: Literal["crop", "pad", "squash"] | None = None, image_size: int = 64, mapped: bool = False,
@@ -50,7 +50,6 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
     Args:
         task: Task name; leave it out with --dataset.
         dataset: Minari dataset id, or path of a dataset in another format (LeRobot, robomimic, OGBench).
-        image_key: Key of the image in dict observations.
         seed: Decides weights and batches.
         out: Run directory. Default: runs/TASK/PRESET/seedSEED.
         resume: Go on with the unfinished run in the run directory.
@@ -68,7 +67,7 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
         from velap.tasks import get_task
 
         get_task(task)
-    train_with_progress(str(task or dataset), preset=preset, seed=seed, out=out, image_key=image_key, device=device,
+    train_with_progress(str(task or dataset), preset=preset, seed=seed, out=out, image_key=joined(image_key), device=device,
                         resume=resume, settings=settings, method=method, loggers=loggers,
                         reading={"success": success, "fit": fit, "image_size": image_size, "mapped": mapped or None})
 

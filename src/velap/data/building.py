@@ -6,7 +6,7 @@ Letters: F frames, E episodes, T transitions of one episode (it has T + 1 frames
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -17,24 +17,24 @@ import numpy as np
 
 from velap.data import checks
 from velap.data.frames import Episode, FrameStore, Reading
-from velap.data.images import FLOAT_RANGES, Fit, ImageLayout, find_image, to_rgb
+from velap.data.images import FLOAT_RANGES, Fit, ImageLayout, find_image, side_by_side
 from velap.data.success import INFO_KEYS, Predicate, Success
 from velap.errors import ConfigError, DatasetError
 
 
 class FrameBuffer:
-    """Frames uint8 [F, side, side, 3] that are added episode by episode."""
+    """Frames uint8 [F, side, width, 3] that are added episode by episode."""
 
-    def __init__(self, side: int, expected: int, path: Path | None) -> None:
+    def __init__(self, side: int, width: int, expected: int, path: Path | None) -> None:
         """`expected` frames are made room for in memory; with `path` they are written to that file."""
-        self._shape = (side, side, 3)
+        self._shape = (side, width, 3)
         self._count = 0
         self._path = path
         self._file = None if path is None else path.open("wb")
         self._held = np.empty((0 if path else max(expected, 1), *self._shape), np.uint8)
 
     def add(self, frames: np.ndarray) -> None:
-        """Frames uint8 [T + 1, side, side, 3] of the next episode."""
+        """Frames uint8 [T + 1, side, width, 3] of the next episode."""
         end = self._count + len(frames)
         if self._file is not None:
             self._file.write(np.ascontiguousarray(frames).data)
@@ -58,15 +58,15 @@ class FrameBuffer:
             self._file.close()
 
 
-def build_store(name: str, episodes: Iterable[Episode], layout: ImageLayout, bounds: tuple[np.ndarray, np.ndarray],
-                reading: Reading, rule: Success | None = None, expected: int = 0, path: Path | None = None,
-                need_success: bool = True) -> FrameStore:
-    """A store of episodes whose images lie as `layout` says. Rewards become 0 and 1, an episode ends at its first success.
+def build_store(name: str, episodes: Iterable[Sequence[Episode]], layouts: Sequence[ImageLayout],
+                bounds: tuple[np.ndarray, np.ndarray], reading: Reading, rule: Success | None = None, expected: int = 0,
+                path: Path | None = None, need_success: bool = True) -> FrameStore:
+    """A store of episodes whose images lie as `layouts` say. Rewards become 0 and 1, an episode ends at its first success.
 
     Args:
         name: of the dataset.
-        episodes: taken once, in order.
-        layout: of the images.
+        episodes: taken once, in order; each as every camera has it.
+        layouts: of the images, one a camera.
         bounds: float32 [A] each, infinite where unknown.
         reading: how to read; the store keeps it with the success rule that was used.
         rule: of success; None finds one: the info `success` or `is_success` where there is one that is ever true, else the
@@ -75,16 +75,21 @@ def build_store(name: str, episodes: Iterable[Episode], layout: ImageLayout, bou
         path: file for the frames; None keeps them in memory.
         need_success: whether data without any success are refused.
     """
-    side = reading.image_size or (max if reading.fit == "pad" else min)(layout.sides)
-    if layout.sides != (side, side):
+    sides = [side for layout in layouts for side in layout.sides]
+    side = reading.image_size or (max if reading.fit == "pad" else min)(sides)
+    for layout in layouts:
+        if layout.sides == (side, side):
+            continue
         how = f" ({reading.fit})" if reading.fit and layout.sides[0] != layout.sides[1] else ""
         checks.notice(f"{name}: images of {layout.sides[0]}×{layout.sides[1]} are resized to {side}×{side}{how}.")
-    frames, parts = FrameBuffer(side, expected, path), _Parts()
+    frames, parts = FrameBuffer(side, side * len(layouts), expected, path), _Parts()
     try:
         for number, raw in enumerate(episodes):
             where = f"{name}, episode {number}"
-            episode = checks.checked_episode(raw, layout, bounds[0].shape, where)
-            frames.add(to_rgb(episode.images, layout, side, reading.fit))
+            views = [checks.checked_episode(each, layout, bounds[0].shape, where)
+                     for each, layout in zip(raw, layouts, strict=True)]
+            episode = views[0]
+            frames.add(side_by_side([each.images for each in views], layouts, side, reading.fit))
             parts.add(episode, None if rule is None else rule.of_episode(number, episode.rewards, episode.terminated,
                                                                          episode.infos, where), number, where)
         if not parts.lengths:
@@ -210,7 +215,7 @@ def build_from_episodes(episodes: Iterable[Episode], name: str, bounds: tuple[An
     first = next(stream, None)
     if first is None:
         raise DatasetError(f"{name} has no episode; expected at least one.")
-    layout = find_image(image_space(np.asarray(first.images)), None, name, fit=fit)
+    layout = find_image(image_space(np.asarray(first.images)), "", name, fit=fit)
     shape = np.asarray(first.actions).shape[1:]
     if len(shape) != 1:
         raise DatasetError(f"{name}, episode 0: the actions have shape {np.shape(first.actions)}; expected one vector a "
@@ -219,7 +224,8 @@ def build_from_episodes(episodes: Iterable[Episode], name: str, bounds: tuple[An
     reading = Reading(image_size=image_size, fit=fit)
 
     def build(path: Path | None) -> FrameStore:
-        return build_store(name, chain([first], stream), layout, (low, high), reading, rule_of(success), path=path)
+        views = ((each,) for each in chain([first], stream))
+        return build_store(name, views, [layout], (low, high), reading, rule_of(success), path=path)
 
     return build(None) if place is None else build_mapped(build, place, f"episodes of {name}")
 

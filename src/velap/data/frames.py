@@ -48,9 +48,9 @@ class Reading:
     """How a dataset was read: what run time has to do in the same way. Checkpoints keep it as JSON."""
 
     image_key: str = ""
-    """Key of the image in Dict observations, `a/b` when nested; empty for plain images."""
+    """Key of the image in Dict observations, `a/b` when nested; empty for plain images. `a,b`: two side by side."""
     image_size: int | None = IMAGE_SIZE
-    """Side that images are resized to [px]; None keeps that of square ones."""
+    """Side that images are resized to, of each camera [px]; None keeps that of square ones."""
     fit: Fit | None = None
     """How oblong images become square; None where they are."""
     success: str = ""

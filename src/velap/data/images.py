@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -88,13 +88,33 @@ def _listing(leaves: dict[tuple[str, ...], gym.Space]) -> str:
     return ", ".join(f"{'/'.join(path) or 'observation'}: {brief(space)}" for path, space in leaves.items())
 
 
-def find_image(space: gym.Space, image_key: str | None, where: str,
-               advice: str = "render the frames into the dataset first", fit: Fit | None = None) -> ImageLayout:
+ADVICE = "render the frames into the dataset first"
+
+
+def find_images(space: gym.Space, image_key: str | None, where: str, advice: str = ADVICE,
+                fit: Fit | None = None) -> tuple[ImageLayout, ...]:
+    """As `find_image`, of every camera that `image_key` names, `a,b`; they stand side by side in a frame."""
+    return tuple(find_image(space, key, where, advice, fit) for key in keys_of(image_key) or ("",))
+
+
+def keys_of(text: str | None) -> list[str]:
+    """The keys in `a,b`."""
+    return [key.strip() for key in text.split(",")] if text else []
+
+
+def side_by_side(images: Sequence[np.ndarray], layouts: Sequence[ImageLayout], size: int | None,
+                 fit: Fit | None = None) -> np.ndarray:
+    """`to_rgb` of K cameras, each [T+1, *layout.shape] → frames uint8 [T+1, size, K · size, 3], in memory of their own."""
+    return np.concatenate([to_rgb(raw, layout, size, fit) for raw, layout in zip(images, layouts, strict=True)], axis=2)
+
+
+def find_image(space: gym.Space, image_key: str, where: str,
+               advice: str = ADVICE, fit: Fit | None = None) -> ImageLayout:
     """The image of an observation space: the one named (`a/b` for nested Dicts), or the only one there is.
 
     Args:
         space: of one observation.
-        image_key: key of the image; needed only where there are several.
+        image_key: key of the image; empty where there is only one.
         where: name of the dataset or environment, for messages.
         advice: what to do where there is no image.
         fit: how an oblong image becomes square; without it such an image is refused.
@@ -116,14 +136,15 @@ def find_image(space: gym.Space, image_key: str | None, where: str,
                            f"[H, W, 3]. velap learns from pixels: {advice}.")
     if len(found) > 1:
         cameras = ", ".join(layout.name for layout in found)
-        raise DatasetError(f"{where} has several images among its observations: {cameras}; expected one. "
-                           f"Name the one to use with --image-key, for example --image-key {found[0].name}.")
+        raise DatasetError(f"{where} has several images among its observations: {cameras}; expected one. Name the one to "
+                           f"use with --image-key, for example --image-key {found[0].name}; several stand side by side.")
     return _checked(found[0], leaves[found[0].key], where, fit)
 
 
 def known_key(space: gym.Space, image_key: str) -> str | None:
-    """The key, if observations of that space have it."""
-    return image_key if image_key and image_key in {"/".join(path) for path, _ in _leaves(space)} else None
+    """The key, or keys `a,b`, if observations of that space have them."""
+    names = {"/".join(path) for path, _ in _leaves(space)}
+    return image_key if image_key and names.issuperset(keys_of(image_key)) else None
 
 
 def _is_picture(layout: ImageLayout, box: gym.Space) -> bool:

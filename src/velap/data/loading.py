@@ -15,7 +15,7 @@ import gymnasium as gym
 from velap.data import checks, minari_io
 from velap.data.building import build_store, rule_of
 from velap.data.frames import Episode, FrameStore, Reading
-from velap.data.images import IMAGE_SIZE, Fit, ImageLayout, find_image
+from velap.data.images import IMAGE_SIZE, Fit, ImageLayout, find_images
 from velap.data.mapped import open_or_build, too_large
 from velap.data.success import Predicate, Success
 from velap.errors import DatasetError
@@ -81,7 +81,8 @@ def load_store(source: str | Path, image_key: str | None = None, min_length: int
 
     Args:
         source: path of the dataset, or its id.
-        image_key: key of the image in Dict observations (`a/b` when nested); needed only where there are several.
+        image_key: key of the image in Dict observations (`a/b` when nested); needed only where there are several. `a,b`
+            puts two cameras side by side in one frame.
         min_length: the longest episode must have this many transitions [steps].
         image_size: side that images are resized to [px]; None keeps that of square ones.
         fit: how oblong images become square: `crop`, `pad` or `squash`.
@@ -95,22 +96,24 @@ def load_store(source: str | Path, image_key: str | None = None, min_length: int
         StorageError: there is no room for the mapped frames.
     """
     reader = find_reader(str(source))
-    layout = find_image(reader.observation_space, image_key, reader.name, fit=fit)
+    layouts = find_images(reader.observation_space, image_key, reader.name, fit=fit)
     bounds = checks.action_bounds(reader.action_space, reader.name)
     rule = rule_of(success)
-    reading = Reading(layout.name, image_size, fit)
-    side = image_size or max(layout.sides)
+    reading = Reading(",".join(layout.name for layout in layouts), image_size, fit)
+    side = image_size or max(side for layout in layouts for side in layout.sides)
 
     def build(path: Path | None) -> FrameStore:
-        store = build_store(reader.name, reader.episodes(layout), layout, bounds, reading, rule, reader.frames, path,
+        views = zip(*(reader.episodes(layout) for layout in layouts), strict=True)
+        store = build_store(reader.name, views, layouts, bounds, reading, rule, reader.frames, path,
                             need_success)
-        if reader.content_sha256 is not None and layout.sides == (side, side) and rule is None \
+        stored = [layout.sides for layout in layouts]
+        if reader.content_sha256 is not None and stored == [(side, side)] and rule is None \
                 and store.content_hash != reader.content_sha256:
             raise minari_io.damaged(reader.name, f"its arrays have SHA-256 {store.content_hash[:12]}…, not "
                                                  f"{reader.content_sha256[:12]}…")
         return store
 
-    if too_large(reader.frames, side) if mapped is None else mapped:
+    if too_large(reader.frames * len(layouts), side) if mapped is None else mapped:
         labels = files_state([Path(rule.name)]) if rule is not None and rule.source == "labels" else ""
         made_from = f"{reader.state()}; {reading.to_json()}; success {rule} {labels}{'' if need_success else ' or none'}"
         try:

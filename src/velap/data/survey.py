@@ -224,13 +224,12 @@ def _scenes(store: FrameStore) -> Scenes:
 
 def _shrunk(frames: np.ndarray) -> np.ndarray:
     """uint8 [*, H, W, 3] → float32 [*, SIDE * SIDE * 3] means of blocks."""
-    side = frames.shape[1]
-    if side < SIDE:
+    if min(frames.shape[1:3]) < SIDE:
         return frames.reshape(len(frames), -1).astype(np.float32)
-    edges = np.linspace(0, side, SIDE + 1).round().astype(np.int64)
-    sums = np.add.reduceat(np.add.reduceat(frames, edges[:-1], axis=1, dtype=np.float32), edges[:-1], axis=2)
-    sizes = np.diff(edges).astype(np.float32)
-    return (sums / (sizes[:, None] * sizes)[..., None]).reshape(len(frames), -1)
+    down, across = (np.linspace(0, side, SIDE + 1).round().astype(np.int64) for side in frames.shape[1:3])
+    sums = np.add.reduceat(np.add.reduceat(frames, down[:-1], axis=1, dtype=np.float32), across[:-1], axis=2)
+    heights, widths = np.diff(down).astype(np.float32), np.diff(across).astype(np.float32)
+    return (sums / (heights[:, None] * widths)[..., None]).reshape(len(frames), -1)
 
 
 class _Places:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -120,7 +121,7 @@ def load_player(what: Evaluation) -> Player:
     """Load the checkpoint, make the agent, and check that model, camera and time limit fit the environment."""
     task_env = TASKS[what.task].env_id if what.task in TASKS else None
     env_id = what.env or get_task(what.task).env_id
-    method = get_method(what.method)
+    method, recorded_kwargs = get_method(what.method), _as_recorded(what.env_kwargs)
     loaded = load_method(what)
     model, config = loaded.model, loaded.config
     if what.env is None and config.task != what.task:
@@ -131,17 +132,32 @@ def load_player(what: Evaluation) -> Player:
     try:
         agent = make_agent(what.method, model, config, _checked_actions(env, model), loaded.head, loaded.settings)
         image_key = what.image_key or known_key(env.observation_space, loaded.reading.image_key)
-        FrameReader(env, size, image_key, loaded.reading.fit)
+        read = FrameReader(env, size, image_key, loaded.reading.fit)
+        if model is not None and read.size != (size, model.spaces.width):
+            got, learnt = image_key or "its only camera", loaded.reading.image_key or "one camera"
+            raise ConfigError(f"{env_id} gives frames of {read.size[0]} × {read.size[1]} px ({got}); expected {size} × "
+                              f"{model.spaces.width} ({learnt}). Name as many cameras, in the same order, with --image-key.")
         max_steps = _time_limit(env, what.max_steps)
     finally:
         env.close()
     key = RunKey(task=what.task if env_id == task_env else env_id, method=what.method, preset=config.preset,
-                 train_seed=loaded.seed, env=env_id, env_kwargs=what.env_kwargs, image_key=image_key,
+                 train_seed=loaded.seed, env=env_id, env_kwargs=recorded_kwargs, image_key=image_key,
                  max_steps=max_steps, success_rule=what.success or loaded.reading.success or None,
                  config_hash=method.config_hash(config, loaded.head, loaded.settings), checkpoint=loaded.digest,
                  code_version=code_version())
     return Player(agent=agent, model=model, config=config, key=key, image_size=size, reading=loaded.reading,
                   make_env=lambda: make_env(env_id, what.env_kwargs))
+
+
+def _as_recorded(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """The environment's arguments as a line of JSON keeps them: tuples become lists."""
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(dict(env_kwargs)))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"the environment's arguments are {dict(env_kwargs)} ({error}); expected numbers, text, lists and "
+                          "dicts, which records can name. Register an environment that makes the others itself, or evaluate "
+                          "an agent: velap.evaluate(velap.load(checkpoint), env=...).") from error
+    return plain
 
 
 def _time_limit(env: gym.Env[Any, Any], asked: int | None) -> int:
@@ -278,7 +294,7 @@ def play(agent: Agent, env: str | MakeEnv | None, seeds: range, *, env_kwargs: M
         env: task name, any Gymnasium id, or a function that makes an environment.
         seeds: episode seeds; test seeds are 0 to 99.
         env_kwargs: arguments of `gymnasium.make` besides the id.
-        image_key: key of the image in dict observations.
+        image_key: key of the image in dict observations; `a,b` puts two cameras side by side.
         max_steps: time limit, if the environment has none, or a shorter one [steps].
         success: what counts as success, a rule of `velap.data.success`; None: the info's `success`, else a positive reward.
         image_size: side of the images that the agent takes [px].
@@ -297,7 +313,7 @@ def play(agent: Agent, env: str | MakeEnv | None, seeds: range, *, env_kwargs: M
     finally:
         first.close()
     key = RunKey(task=name, method=agent.method, preset="none", train_seed=0, env=name, config_hash="", checkpoint="",
-                 code_version=code_version(), env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=limit,
+                 code_version=code_version(), image_key=image_key, max_steps=limit,
                  success_rule=success)
     player = Player(agent=agent, model=None, config=Config(task=name, preset="none"), key=key, image_size=image_size,
                     make_env=lambda: make_env(env_id, env_kwargs))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap.data.frames import stack_indices
-from velap.data.images import Fit, find_image, to_rgb
+from velap.data.images import Fit, find_images, side_by_side
 from velap.data.success import Success, success_of
 from velap.errors import ConfigError
 from velap.methods.base import Agent, FollowsTree
@@ -61,21 +61,25 @@ Observer = Callable[[Moment], None]
 
 
 class FrameReader:
-    """Observations of one environment -> images uint8 [side, side, 3], by the rules that datasets are read by."""
+    """Observations of one environment -> frames uint8 [side, side, 3], by the rules that datasets are read by; several
+    cameras stand side by side."""
 
     def __init__(self, env: gym.Env[Any, Any], side: int, image_key: str | None = None, fit: Fit | None = None) -> None:
         """`fit` is how the dataset's oblong images became square."""
         self._name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
-        self._layout = find_image(env.observation_space, image_key, self._name, NO_PIXELS, fit)
+        self._layouts = find_images(env.observation_space, image_key, self._name, NO_PIXELS, fit)
         self._side, self._fit = side, fit
+        self.size = (side, side * len(self._layouts))
+        """Height and width of the frames [px]."""
 
     def __call__(self, observation: Any) -> NDArray[np.uint8]:
-        """The image of one observation, a copy: environments may write the next one into the same memory."""
-        image = self._layout.of(observation)
-        if image.dtype != self._layout.dtype or image.shape != self._layout.shape:
-            raise ConfigError(f"{self._name} returned {image.dtype}{list(image.shape)}; its observation space promises "
-                              f"{self._layout.dtype}{list(self._layout.shape)}. Mend the environment.")
-        return to_rgb(image[None], self._layout, self._side, self._fit)[0].copy()
+        """The frame of one observation, a copy: environments may write the next one into the same memory."""
+        images = [layout.of(observation) for layout in self._layouts]
+        for image, layout in zip(images, self._layouts, strict=True):
+            if image.dtype != layout.dtype or image.shape != layout.shape:
+                raise ConfigError(f"{self._name} returned {image.dtype}{list(image.shape)}; its observation space promises "
+                                  f"{layout.dtype}{list(layout.shape)}. Mend the environment.")
+        return side_by_side([image[None] for image in images], self._layouts, self._side, self._fit)[0]
 
 
 @dataclass

@@ -264,15 +264,15 @@ def _number(axes: Any, places: NDArray[np.floating[Any]]) -> None:
 
 
 def _draw_frames(axes: Any, frames: NDArray[np.uint8]) -> None:
-    """Frames [C, S, S, 3] in three columns, with their numbers."""
-    side, gap = frames.shape[1], max(2, frames.shape[1] // 20)
+    """Frames [C, H, W, 3] in three columns, with their numbers."""
+    (height, width), gap = frames.shape[1:3], max(2, frames.shape[1] // 20)
     lines = -(-len(frames) // 3)
-    sheet = np.full((lines * (side + gap) - gap, 3 * (side + gap) - gap, 3), 255, np.uint8)
-    corners = [(number // 3 * (side + gap), number % 3 * (side + gap)) for number in range(len(frames))]
+    sheet = np.full((lines * (height + gap) - gap, 3 * (width + gap) - gap, 3), 255, np.uint8)
+    corners = [(number // 3 * (height + gap), number % 3 * (width + gap)) for number in range(len(frames))]
     for (top, left), frame in zip(corners, frames, strict=True):
-        sheet[top : top + side, left : left + side] = frame
+        sheet[top : top + height, left : left + width] = frame
     axes.imshow(sheet, interpolation="nearest")
-    _number(axes, np.array([(left + 0.88 * side, top + 0.12 * side) for top, left in corners]))
+    _number(axes, np.array([(left + 0.88 * width, top + 0.12 * height) for top, left in corners]))
     axes.axis("off")
 
 

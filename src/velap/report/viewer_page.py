@@ -124,10 +124,11 @@ def _tiles(plans: Sequence[MadePlan], backdrop: RealStates | None) -> dict[int, 
 
 
 def _webp(image: NDArray[np.uint8], side: int, lossless: bool = False) -> str:
-    """A picture as a data URI."""
+    """A picture of that height as a data URI."""
     content, picture = io.BytesIO(), Image.fromarray(image)
-    if picture.size != (side, side):
-        picture = picture.resize((side, side), Image.Resampling.BOX)
+    size = (round(side * image.shape[1] / image.shape[0]), side)
+    if picture.size != size:
+        picture = picture.resize(size, Image.Resampling.BOX)
     picture.save(content, "WEBP", quality=QUALITY, lossless=lossless)
     return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()
 

@@ -26,7 +26,7 @@ from websockets.http11 import Request, Response
 
 from velap.errors import ConfigError, VelapError
 from velap.serve.messages import MAX_MESSAGE, MessageError, pack, unpack
-from velap.serve.session import Policy, Session
+from velap.serve.session import PictureReader, Policy, Session
 from velap.signals import stop_signals
 from velap.threads import one_thread
 
@@ -55,7 +55,8 @@ class Server:
             host: address to listen on; other than this machine's own only with an `api_key`.
             port: 0 takes a free one.
             api_key: what clients must send as `Authorization: Api-Key KEY`; None lets every client of this machine in.
-            image_key: key of the picture in observations; None takes the only picture there is.
+            image_key: key of the picture in observations, or `a,b` of several; None takes the only picture there is, or
+                those named as in the training data.
             max_clients: connections at once.
             max_message: longest message that is read [bytes].
         """
@@ -66,6 +67,7 @@ class Server:
             raise ConfigError(f"the port is {port}; expected 0 to 65535, 0 for a free one. Name another with --port.")
         if api_key == "":
             raise ConfigError("the API key is empty; expected some text. Set VELAP_API_KEY to it, or leave it unset.")
+        PictureReader(policy.spaces, image_key, policy.reading)  # other cameras than the model's are an error of the start
         self._policy, self._host, self._port, self._image_key = policy, host, port, image_key
         self._authorization = None if api_key is None else f"Api-Key {api_key}".encode()
         self._max_clients, self._max_message = max_clients, max_message

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from velap._version import __version__
 from velap.data.frames import Reading, stack_indices
-from velap.data.images import MIN_SIDE, ImageLayout, to_rgb
-from velap.errors import ObservationError
+from velap.data.images import MIN_SIDE, ImageLayout, keys_of, to_rgb
+from velap.errors import ConfigError, ObservationError
 from velap.methods.base import Agent, get_method, make_agent
 from velap.methods.heads import head_path, load_head
 from velap.models.checkpoint import WEIGHTS_SHA256, load_checkpoint
@@ -103,25 +103,33 @@ class Session:
 
 
 class PictureReader:
-    """The camera's picture of an observation, as the model reads it: uint8 [H, W, 3].
+    """The camera's picture of an observation, as the model reads it: uint8 [H, W, 3]; of several cameras side by side.
 
     Pictures are uint8, [h, w, 3], [3, h, w] or grey. Those of other sizes than the model's become square and are resized as
     the training data were. Everything else is an ObservationError.
 
     Args:
         spaces: of the model.
-        key: key of the picture, `a/b` when nested; None takes the only picture, or the one that is named as the training
-            data's was.
+        key: key of the picture, `a/b` when nested, or `a,b` of several cameras; None takes the only picture, or those that
+            are named as the training data's were.
         reading: how the training data were read.
     """
 
     def __init__(self, spaces: Spaces, key: str | None = None, reading: Reading | None = None) -> None:
-        self._size = (spaces.height, spaces.width)
-        self._key = key
         self._reading = reading or Reading(image_size=spaces.height)
+        learnt = keys_of(self._reading.image_key)
+        self._keys = keys_of(key) or (learnt if len(learnt) > 1 else [])
+        if max(len(self._keys), 1) != max(len(learnt), 1):
+            raise ConfigError(f"got the cameras {', '.join(self._keys)}; expected as many as in the training data "
+                              f"({', '.join(learnt) or 'one, without a name'}). Name as many, in the same order, with "
+                              "--image-key.")
+        self._size = (spaces.height, spaces.width // max(len(learnt), 1))
 
     def __call__(self, observation: Mapping[str, Any]) -> NDArray[np.uint8]:
-        name, raw = self._find(observation)
+        return np.concatenate([self._frame(*self._find(observation, key)) for key in self._keys or ("",)], axis=1)
+
+    def _frame(self, name: str, raw: np.ndarray) -> NDArray[np.uint8]:
+        """One camera's picture, square and resized."""
         height, width = self._size
         got = f"the picture {name!r} is {raw.dtype}{list(raw.shape)}; expected uint8[{height}, {width}, 3]"
         if raw.dtype != np.uint8:
@@ -138,14 +146,14 @@ class PictureReader:
                                    "data.")
         return to_rgb(raw[None], layout, height, self._reading.fit)[0].copy()
 
-    def _find(self, observation: Mapping[str, Any]) -> tuple[str, np.ndarray]:
-        """Name and array of the picture: the key's, or the only array that may be one."""
+    def _find(self, observation: Mapping[str, Any], key: str) -> tuple[str, np.ndarray]:
+        """Name and array of the picture: the key's, or without one the only array that may be one."""
         arrays = dict(_arrays(observation))
-        if self._key is not None:
-            if self._key not in arrays:
-                raise ObservationError(f"the observation has no array {self._key!r}; it has {_listing(arrays)}. Send the "
+        if key:
+            if key not in arrays:
+                raise ObservationError(f"the observation has no array {key!r}; it has {_listing(arrays)}. Send the "
                                        "picture under that key, or name another one with --image-key.")
-            return self._key, arrays[self._key]
+            return key, arrays[key]
         found = {name: array for name, array in arrays.items()
                  if array.ndim == 3 or (array.dtype == np.uint8 and _layout(array) is not None)}
         if self._reading.image_key in found:
