@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
+import contextlib
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -19,23 +20,6 @@ from velap.storage import locked, run_dir
 from velap.training import frozen
 
 
-def take_turns(path: Path, turns: int, clashes: multiprocessing.Queue[int]) -> None:
-    """Hold the lock `turns` times, and count who else holds it meanwhile."""
-    clashed, done = 0, 0
-    while done < turns:
-        try:
-            with locked(path):
-                try:
-                    os.close(os.open(path.with_name("inside"), os.O_CREAT | os.O_EXCL))
-                    path.with_name("inside").unlink()
-                except OSError:
-                    clashed += 1
-            done += 1
-        except BlockingIOError:
-            pass
-    clashes.put(clashed)
-
-
 def test_every_id_is_a_folder_on_every_system() -> None:
     assert run_dir("my_package:Robot-v0", "default", 0) == Path("runs/my_package_Robot-v0/default/seed0")
     assert run_dir(r"C:\data\robot.npz", "default", 0) == Path("runs/C__data_robot.npz/default/seed0")
@@ -44,14 +28,14 @@ def test_every_id_is_a_folder_on_every_system() -> None:
 
 
 def test_a_lock_has_one_holder_however_often_it_changes_hands(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("fork")
-    clashes: multiprocessing.Queue[int] = context.Queue()
-    workers = [context.Process(target=take_turns, args=(tmp_path / "lock", 400, clashes)) for _ in range(4)]
-    for worker in workers:
-        worker.start()
-    assert sum(clashes.get(timeout=90) for _ in workers) == 0
-    for worker in workers:
-        worker.join()
+    command = [sys.executable, Path(__file__).with_name("lock_turns.py"), tmp_path / "lock", "10", "60"]
+    with contextlib.ExitStack() as running:
+        workers = [running.enter_context(subprocess.Popen(command, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+                   for _ in range(3)]
+        assert [worker.stdout.readline() for worker in workers] == ["ready\n"] * 3  # type: ignore[union-attr]
+        for worker in workers:
+            worker.stdin.close()  # type: ignore[union-attr]  # all begin at once
+        assert [worker.stdout.read() for worker in workers] == ["10 0\n"] * 3  # type: ignore[union-attr]
     assert list(tmp_path.iterdir()) == []
 
 
