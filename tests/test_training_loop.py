@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -63,6 +64,16 @@ class Kept:
 
     def close(self):
         self.closed = True
+
+
+def test_a_training_that_fails_closes_its_loggers(tmp_path):
+    def fail(progress):
+        raise OverflowError
+
+    kept, threads = Kept(), threading.active_count()
+    with pytest.raises(OverflowError):
+        train(config(), make_store(), tmp_path, device="cpu", loggers=["tensorboard", kept], on_progress=fail)
+    assert kept.closed and threading.active_count() == threads
 
 
 def test_loggers_are_the_callers(tmp_path):

@@ -19,7 +19,7 @@ class Logger(Protocol):
         ...
 
     def close(self) -> None:
-        """The training ends or pauses."""
+        """The training ends, pauses or fails."""
         ...
 
 

@@ -8,7 +8,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -88,32 +88,39 @@ class Run(Protocol):
 
 def run_steps(run: Run, loggers: Sequence[Logger], on_progress: Callable[[Progress], None],
               interrupted: threading.Event) -> None:
-    """Update to the end or until interrupted; logs, diagnoses, saves, and raises TrainingError when a loss is not finite."""
+    """Update to the end or until interrupted; logs, diagnoses, saves, and raises TrainingError when a loss is not finite.
+    The loggers are closed however it ends."""
     every = run.cadence
     clock = time.monotonic()
-    while run.step < run.total and not interrupted.is_set():
-        info = run.update()
-        row: dict[str, float] = {}
-        last = run.step == run.total
-        if run.step % every.log == 0 or last:
-            row |= {name: float(value) for name, value in info.items()}
-            bad = sorted(name for name, value in row.items() if not math.isfinite(value))
-            if bad:
-                kept = f"the last good state is in {run.state_path}" if run.state_path.exists() else "no state is kept yet"
-                raise TrainingError(f"{', '.join(bad)} became NaN or infinite at step {run.step}; expected finite losses. "
-                                    f"Check the data for bad actions and rewards; {kept}.")
-        if run.step % every.diagnose == 0 or last:
-            row |= run.report()
-        now = time.monotonic()
-        run.seconds, clock = run.seconds + now - clock, now
-        if row:
-            for logger in loggers:
-                logger.log(run.step, run.phase, run.seconds, row)
-            on_progress(Progress(run.phase, run.step, run.total, run.seconds, row))
-        if run.step % every.checkpoint == 0:
-            run.save()
-    for logger in loggers:
-        logger.close()
+    with contextlib.ExitStack() as at_end:
+        for logger in loggers:
+            at_end.callback(logger.close)
+        while run.step < run.total and not interrupted.is_set():
+            info = run.update()
+            row: dict[str, float] = {}
+            last = run.step == run.total
+            if run.step % every.log == 0 or last:
+                row |= {name: float(value) for name, value in info.items()}
+                _check_finite(row, run)
+            if run.step % every.diagnose == 0 or last:
+                row |= run.report()
+            now = time.monotonic()
+            run.seconds, clock = run.seconds + now - clock, now
+            if row:
+                for logger in loggers:
+                    logger.log(run.step, run.phase, run.seconds, row)
+                on_progress(Progress(run.phase, run.step, run.total, run.seconds, row))
+            if run.step % every.checkpoint == 0:
+                run.save()
+
+
+def _check_finite(losses: Mapping[str, float], run: Run) -> None:
+    """Raises TrainingError."""
+    bad = sorted(name for name, value in losses.items() if not math.isfinite(value))
+    if bad:
+        kept = f"the last good state is in {run.state_path}" if run.state_path.exists() else "no state is kept yet"
+        raise TrainingError(f"{', '.join(bad)} became NaN or infinite at step {run.step}; expected finite losses. "
+                            f"Check the data for bad actions and rewards; {kept}.")
 
 
 @contextlib.contextmanager
