@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -42,36 +42,60 @@ EPISODES, QUICK_EPISODES, FIRST_SEED = 50, 10, 1000
 BATCH = 25
 METHODS = ("td3bc", "velap")
 """π^g alone, and the planner."""
-HAND, STEP = 0.08, 0.008
-"""Units of the latent: position of the hand and its displacement in a step [m]."""
+UNITS = {2: (0.2, 0.05), 3: (0.08, 0.008)}
+"""Units of the latent by the entries of the agent's position: where a block or a hand is, and its way in a step [m]."""
 JOINT_SHARE, LEAST = 0.2, 1e-3
 """Units of joints, as a share of their range in the data, and the smallest unit; the unit of places is their deviation."""
-SIDE = 64
+SIDE = 16
 """Side of the pictures that carry a state in their bytes [px]."""
 
 
-def pack(state: NDArray[np.float32], joints: int, shape: tuple[int, ...] = (SIDE, SIDE, 3)) -> NDArray[np.uint8]:
-    """A state [S] as a picture uint8: S, the number of joints, then the bytes of the state."""
+class Layout(NamedTuple):
+    """The first entries of a state."""
+
+    position: int
+    """Of the agent's position."""
+    joints: int
+    """Joints of objects, behind the position."""
+
+
+def pack(state: NDArray[np.float32], layout: Layout) -> NDArray[np.uint8]:
+    """A state [S] as a picture uint8 [SIDE, SIDE, 3]: S, the layout, then the bytes of the state."""
     raw = np.frombuffer(state.astype(np.float32).tobytes(), np.uint8)
-    picture = np.zeros(int(np.prod(shape)), np.uint8)
-    picture[: 2 + len(raw)] = np.concatenate([np.array([len(state), joints], np.uint8), raw])
-    return picture.reshape(shape)
+    picture = np.zeros(SIDE * SIDE * 3, np.uint8)
+    picture[: 3 + len(raw)] = np.concatenate([np.array([len(state), *layout], np.uint8), raw])
+    return picture.reshape(SIDE, SIDE, 3)
 
 
-def unpack(pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], int]:
-    """States [*, S] of pictures uint8 [*, H, W, 3], and the number of joints."""
+def pack_world(world: Any) -> NDArray[np.uint8]:
+    """The true state of a world that knows it, packed."""
+    return pack(world.true_state(), Layout(len(world.agent_position()), len(getattr(world, "joints", ()))))
+
+
+def unpack(pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], Layout]:
+    """States [*, S] of pictures uint8 [*, SIDE, SIDE, 3], and their layout."""
     flat = pictures.reshape(*pictures.shape[:-3], -1)
-    entries, joints = (int(value) for value in flat.reshape(-1, flat.shape[-1])[0, :2])
-    return np.ascontiguousarray(flat[..., 2 : 2 + 4 * entries]).view(np.float32), joints
+    entries, *layout = (int(value) for value in flat.reshape(-1, flat.shape[-1])[0, :3])
+    return np.ascontiguousarray(flat[..., 3 : 3 + 4 * entries]).view(np.float32), Layout(*layout)
 
 
-def without_drawing(task: Task, picture: Callable[[Any], NDArray[Any]]) -> gym.Env[Any, Any]:
-    """The task's environment with `picture(world)` in place of its frame."""
-    kind: Any = type(make_env(task.env_id).unwrapped)
+def without_drawing(task: Task) -> gym.Env[Any, Any]:
+    """The task's environment, without a time limit, with packed states in place of its frames."""
+    made = make_env(task.env_id)
+    kind: Any = type(made.unwrapped)
+    if not isinstance(made.unwrapped, WithTrueState):
+        raise ConfigError(f"{task.name} has no true state; expected a task whose environment is "
+                          "`velap.envs.protocol.WithTrueState`.")
 
     class Undrawn(kind):
-        def render(self, size: int = SIDE) -> NDArray[Any]:
-            return picture(self)
+        spec = made.spec
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.observation_space = gym.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
+
+        def render(self, size: int = SIDE) -> NDArray[np.uint8]:
+            return pack_world(self)
 
     env: gym.Env[Any, Any] = Undrawn()
     return env
@@ -80,23 +104,18 @@ def without_drawing(task: Task, picture: Callable[[Any], NDArray[Any]]) -> gym.E
 def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view: ProgressBar | None = None) -> FrameStore:
     """The trajectories that `velap collect` records, with packed states in place of frames; of the first `contexts` if
     given."""
-    if not isinstance(make_env(task.env_id).unwrapped, WithTrueState):
-        raise ConfigError(f"{task.name} has no true state; expected one of the manipulation tasks.")
-    env: Any = without_drawing(task, lambda world: world.true_state())
+    env = without_drawing(task)
     runs = []
-    count = contexts or task.recipe.contexts
-    for context in range(count):
+    for context in range(contexts or task.recipe.contexts):
         for trajectory in range(task.recipe.trajectories):
             runs.append(run_trajectory(env, task.recipe, task.shares, seed, context, trajectory))
         if view is not None:
             view.show(context + 1)
     rows = {name: np.concatenate([run[name] for run in runs])
             for name in ("frames", "actions", "rewards", "terminated", "truncated", "length")}
-    joints = len(env.joints)
-    width = -(-(2 + 4 * rows["frames"].shape[1]) // 3)
-    frames = np.stack([pack(state, joints, (1, width, 3)) for state in rows["frames"]])
     space = env.action_space
-    return FrameStore.from_arrays(frames=frames, actions=rows["actions"], rewards=rows["rewards"],
+    assert isinstance(space, gym.spaces.Box)
+    return FrameStore.from_arrays(frames=rows["frames"], actions=rows["actions"], rewards=rows["rewards"],
                                   terminated=rows["terminated"], truncated=rows["truncated"],
                                   episode_length=rows["length"], action_low=space.low, action_high=space.high,
                                   dataset_id=f"{task.name}/states")
@@ -104,40 +123,46 @@ def collect_states(task: Task, contexts: int | None = None, seed: int = 0, view:
 
 @register_encoder("exact-states")
 class ExactEncoder(Encoder):
-    """Hand, joints and places in comparable units, and the hand's last two steps; zeros behind."""
+    """Position, joints and places in comparable units, and the agent's last two steps; zeros behind."""
 
     def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
         super().__init__()
         self.latent_dim = config.latent_dim
-        self.mean: NDArray[np.float32] = np.zeros(1, np.float32)
-        self.scale: NDArray[np.float32] = np.ones(1, np.float32)
+        self.register_buffer("entries", torch.zeros(2, dtype=torch.int64))
+        self.register_buffer("mean", torch.zeros(config.latent_dim))
+        self.register_buffer("scale", torch.ones(config.latent_dim))
+        self.entries: Tensor
+        """S, and how many of them are the agent's position."""
+        self.mean: Tensor
+        self.scale: Tensor
+        """float32 [S], unit of each entry; longer than S."""
 
     def fit(self, frames: Tensor, last: Tensor, seed: int) -> Tensor:
         """Find the unit of each entry [S] from the states of the data."""
-        states, joints = unpack(frames.numpy())
-        entries = states.shape[1]
-        if entries + 6 > self.latent_dim:
-            raise ConfigError(f"config field `latent_dim` is {self.latent_dim}; expected at least {entries + 6} for this "
-                              "state.")
-        self.mean, scale = states.mean(0), states.std(0)
-        scale[:3] = HAND
-        moving = slice(3, 3 + joints)
+        states, layout = unpack(frames.cpu().numpy())
+        entries, place = states.shape[1], layout.position
+        if entries + 2 * place > self.latent_dim:
+            raise ConfigError(f"config field `latent_dim` is {self.latent_dim}; expected at least {entries + 2 * place} for "
+                              "this state.")
+        scale = states.std(0)
+        scale[:place] = UNITS[place][0]
+        moving = slice(place, place + layout.joints)
         scale[moving] = JOINT_SHARE * np.ptp(states[:, moving], axis=0)
-        self.scale = np.maximum(scale, LEAST)
+        self.entries.copy_(torch.tensor([entries, place]))
+        self.mean[:entries] = torch.from_numpy(states.mean(0))
+        self.scale[:entries] = torch.from_numpy(np.maximum(scale, LEAST))
         return frames
 
     def encode(self, stacks: Tensor) -> Tensor:
-        """Packed states uint8 [M, N, H, W, 3] -> latents [M, D]."""
-        return torch.from_numpy(self.latents(unpack(stacks.numpy())[0]))
-
-    def latents(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Stacked states [*, N, S], oldest first -> [*, D]."""
-        hand = states[..., :3]
-        last = hand[..., -1, :] - hand[..., max(hand.shape[-2] - 2, 0), :]
-        before = hand[..., max(hand.shape[-2] - 2, 0), :] - hand[..., max(hand.shape[-2] - 3, 0), :]
-        known = np.concatenate([(states[..., -1, :] - self.mean) / self.scale, last / STEP, before / STEP], -1)
-        latent = np.zeros((*known.shape[:-1], self.latent_dim), np.float32)
-        latent[..., : known.shape[-1]] = known
+        """Packed states uint8 [M, N, SIDE, SIDE, 3], oldest first -> latents [M, D]."""
+        states = torch.from_numpy(unpack(stacks.cpu().numpy())[0]).to(stacks.device)
+        entries, place = self.entries.tolist()
+        where = states[..., :place]
+        now, before, oldest = (where[:, max(where.shape[1] - back, 0)] for back in (1, 2, 3))
+        step = UNITS[place][1]
+        latent = states.new_zeros(len(states), self.latent_dim)
+        latent[:, :entries] = (states[:, -1] - self.mean[:entries]) / self.scale[:entries]
+        latent[:, entries : entries + 2 * place] = torch.cat([now - before, before - oldest], -1) / step
         return latent
 
 
@@ -157,7 +182,6 @@ def learn(data: FrameStore, config: Config, seed: int, view: ProgressBar | None 
         if view is not None:
             view.show(trainer.step, title=f"exact latents, {trainer.phase} phase")
     model = trainer.model.eval()
-    model.spaces = dataclasses.replace(model.spaces, height=SIDE, width=SIDE)  # episodes pack states into square pictures
     measure_latents(model, trainer.sampler, make_generator(seed, stream=2))
     return model
 
@@ -166,8 +190,7 @@ def play(task: Task, model: LatentModel, config: Config, *, method: str, seeds: 
          view: ProgressBar | None = None) -> list[Any]:
     """Episodes of a method that sees packed states."""
     def make() -> gym.Env[Any, Any]:
-        env = without_drawing(task, lambda world: pack(world.true_state(), len(world.joints)))
-        return gym.wrappers.TimeLimit(env, task.max_steps)
+        return gym.wrappers.TimeLimit(without_drawing(task), task.max_steps)
 
     envs = make_envs(make, min(BATCH, len(seeds)))
     agent = make_agent(method, model, config, envs[0].action_space)

@@ -9,23 +9,31 @@ import torch
 from rich.console import Console
 
 import velap.envs  # noqa: F401 - registers the tasks
-from studies.exact_latents import ExactEncoder, collect_states, pack, study_exact_latents, unpack
+from studies.exact_latents import (
+    SIDE,
+    ExactEncoder,
+    Layout,
+    collect_states,
+    pack,
+    study_exact_latents,
+    unpack,
+    without_drawing,
+)
 from velap.config import ModelConfig
 from velap.data.behaviours import position_of, run_trajectory
 from velap.data.frames import stack_indices
 from velap.errors import ConfigError
-from velap.tasks import get_task
+from velap.tasks import Recipe, Task, get_task
 
 
 def test_states_survive_their_pictures():
     states = np.random.default_rng(0).normal(size=(2, 3, 9)).astype(np.float32)
-    for shape in ((64, 64, 3), (1, 13, 3)):
-        pictures = np.stack([np.stack([pack(state, 4, shape) for state in row]) for row in states])
-        found, joints = unpack(pictures)
-        assert pictures.shape == (2, 3, *shape) and np.array_equal(found, states) and joints == 4
+    pictures = np.stack([np.stack([pack(state, Layout(3, 4)) for state in row]) for row in states])
+    found, layout = unpack(pictures)
+    assert pictures.shape == (2, 3, SIDE, SIDE, 3) and np.array_equal(found, states) and layout == (3, 4)
 
 
-@pytest.mark.parametrize("name", ["WindowClose", "FaucetClose", "ButtonWall", "DrawerButton"])
+@pytest.mark.parametrize("name", ["ObstacleMaze", "WindowClose", "FaucetClose", "ButtonWall", "DrawerButton"])
 def test_states_are_those_of_the_recorded_trajectories(name):
     task = get_task(name)
     data = collect_states(task, contexts=1)
@@ -34,18 +42,18 @@ def test_states_are_those_of_the_recorded_trajectories(name):
     start, length = data.episode_start[1], data.episode_length[1]
     rows = slice(start, start + length + 1)
     assert np.array_equal(recorded["actions"], data.actions[rows]), "drawing must not change what happens"
-    assert np.allclose(recorded["positions"], unpack(data.frames[rows])[0][:, :3])
-    assert np.allclose(env.true_state()[:3], position_of(env))
+    assert np.allclose(recorded["positions"], unpack(data.frames[rows])[0][:, : len(position_of(env))])
+    assert np.allclose(env.true_state()[: len(position_of(env))], position_of(env))
 
 
 def test_data_and_episodes_are_encoded_alike():
     data = collect_states(get_task("DrawerButton"), contexts=1)
-    states, joints = unpack(data.frames)
+    states, layout = unpack(data.frames)
     encoder = ExactEncoder(ModelConfig(latent_dim=32), (64, 64))
     features = encoder.fit(torch.from_numpy(data.frames), torch.from_numpy(data.last), 0)
     rows = stack_indices(np.arange(len(states)), data.first, 3)
     of_data = encoder.encode(features[torch.from_numpy(rows)])
-    packed = np.stack([[pack(state, joints) for state in stack] for stack in states[rows[:50]]])
+    packed = np.stack([[pack(state, layout) for state in stack] for stack in states[rows[:50]]])
     assert torch.allclose(of_data[:50], encoder(torch.from_numpy(packed)))
     assert of_data.shape == (len(states), 32) and (of_data[:, 16:] == 0).all()
     moved = (states[2, :3] - states[1, :3]) / 0.008
@@ -54,12 +62,21 @@ def test_data_and_episodes_are_encoded_alike():
         ExactEncoder(ModelConfig(latent_dim=8), (64, 64)).fit(torch.from_numpy(data.frames), torch.from_numpy(data.last), 0)
 
 
-def test_mazes_tell_no_state():
-    with pytest.raises(ConfigError, match="manipulation"):
-        collect_states(get_task("SpiralMaze"), contexts=1)
+def test_the_bars_of_a_room_are_part_of_its_state():
+    room = gym.make("velap/ObstacleMaze-v0").unwrapped
+    room.reset(seed=1000)
+    lower, upper = room.true_state()[2:4], room.true_state()[4:6]
+    assert lower[1] < upper[1] and lower[0] * upper[0] < 0, "the bars stand at opposite sides"
+    held = [wall for wall in room.layout.walls if wall.contains(lower) or wall.contains(upper)]
+    assert len(held) == 2
 
 
-@pytest.mark.parametrize("task", ["WindowClose", "DrawerButton"])
+def test_what_has_no_state_is_refused():
+    with pytest.raises(ConfigError, match="Blind has no true state"):
+        without_drawing(Task("Blind", "CartPole-v1", 10, Recipe(1, 1, 1)))
+
+
+@pytest.mark.parametrize("task", ["SpiralMaze", "WindowClose", "DrawerButton"])
 def test_the_study_learns_and_plays(tmp_path, monkeypatch, task):
     quick = {"model": {"bank_size": 10}, "planner": {"n_iter": 20},
              "train": {"latent": {"steps": 2, "horizon": 3}, "values": {"steps": 2}, "clone": {"steps": 0},

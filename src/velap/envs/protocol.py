@@ -101,4 +101,4 @@ class WithTrueState(Protocol):
     """Knows the state that frames show. `velap study exact-latents` learns from it instead of frames."""
 
     def true_state(self) -> NDArray[np.float32]:
-        """[number]."""
+        """[number], the agent's position first."""

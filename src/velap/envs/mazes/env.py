@@ -142,6 +142,10 @@ class BlockMaze(PixelTask):
         """The block's centre (x, y) [2] [m]."""
         return self.data.qpos.copy()
 
+    def true_state(self) -> NDArray[np.float32]:
+        """What a frame shows, in numbers: the block's centre [2] [m]. For studies and tests; agents never see it."""
+        return self.agent_position().astype(np.float32)
+
     def set_agent_position(self, position: NDArray[np.float64]) -> None:
         """Put the block to rest at (x, y) [2] [m]; raises ConfigError where it does not fit."""
         position = np.asarray(position, dtype=np.float64)

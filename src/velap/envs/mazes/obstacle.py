@@ -11,6 +11,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from velap.envs.mazes.env import BlockMaze
 from velap.envs.mazes.geometry import Layout, frame_walls
@@ -85,3 +86,8 @@ class ObstacleMaze(BlockMaze):
         if context >= count:
             raise ConfigError(f"context {context} in the {split} split of ObstacleMaze; expected 0 to {count - 1}.")
         return obstacle_layout(first + context)
+
+    def true_state(self) -> NDArray[np.float32]:
+        """The block's centre [2] and the centres of the lower and the upper bar [4] [m]."""
+        lower, upper = self.layout.walls[-2:]
+        return np.array([*self.agent_position(), *lower.centre, *upper.centre], np.float32)
