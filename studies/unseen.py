@@ -120,7 +120,7 @@ def measure(model: LatentModel, config: Config, unseen: Walks) -> dict[str, Any]
 
 def probe(latents: NDArray[np.floating[Any]], states: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Errors [C, S] of ridge regression from latents [C, D] to states [C, S], each scene by a fit on other scenes."""
-    ridge = make_pipeline(StandardScaler(), RidgeCV(np.logspace(-4, 4, 9)))
+    ridge = make_pipeline(StandardScaler(), RidgeCV(np.logspace(-4, 4, 9), alpha_per_target=True))
     guessed = cross_val_predict(ridge, latents.astype(np.float64), states, cv=KFold(FOLDS))
     difference: NDArray[np.float64] = guessed - states
     return difference

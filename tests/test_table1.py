@@ -1,4 +1,5 @@
-"""`velap table 1`: which cells are missing or outdated, the workflow that makes them, and tables against committed ones."""
+"""`velap table 1` and `11`: which cells are missing or outdated, the workflow that makes them, and tables against committed
+ones."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ import pytest
 from studies.table1 import tables
 from studies.table1.cells import (
     METHOD_ORDER,
-    TASK_ORDER,
+    TABLES,
     Cell,
     expected_hash,
     file_metadata,
@@ -31,7 +32,7 @@ from studies.table1.cells import (
     training_seconds,
 )
 from studies.table1.page import results_page
-from studies.table1.paper import METHODS, TABLE_1
+from studies.table1.paper import METHODS, TABLE_1, TABLE_11
 from studies.table1.workflow import to_do
 from velap import cli
 from velap.config import override
@@ -89,8 +90,16 @@ def test_the_papers_table_is_whole() -> None:
     assert set(METHODS) <= set(METHOD_ORDER)
 
 
+def test_table_11_is_whole_and_has_its_own_tasks() -> None:
+    assert (TABLE_11["Sponge", "velap"], TABLE_11["Sponge", "bc"], TABLE_11["Rope", "iris"]) == (14, 5, 2)
+    assert len(TABLE_11) == 8 and {task for task, _ in TABLE_11} == set(TABLES["11"])
+    assert {cell.task for cell in parse_only((), "11")} == {"Sponge", "Rope"}
+    with pytest.raises(UnknownTaskError, match="unknown task 'SpiralMaze'; expected some of Sponge, Rope"):
+        parse_only(["task=SpiralMaze"], "11")
+
+
 def test_only_picks_cells_and_leaves_the_other_axes_alone() -> None:
-    assert len(parse_only()) == len(TASK_ORDER) * len(METHOD_ORDER)
+    assert len(parse_only()) == len(TABLES["1"]) * len(METHOD_ORDER)
     assert [str(cell) for cell in parse_only(["task=SpiralMaze", "method=velap,bc", "seed=0,2"])] == [
         "SpiralMaze bc default seed 0", "SpiralMaze bc default seed 2", "SpiralMaze velap default seed 0",
         "SpiralMaze velap default seed 2"]
@@ -271,6 +280,22 @@ def test_the_page_and_the_files_are_written_from_the_records(capsys: pytest.Capt
     assert "note: " in capsys.readouterr().out
     assert cli.main(command) == 0
     assert Path("docs/results.md").read_text() == page, "the same records give the same page"
+
+
+def test_table_11_stands_beside_the_robots_episodes() -> None:
+    sponge = [Cell("Sponge", method, "default", 0) for method in ("velap", "td3bc")]
+    fill(sponge[0], [True] * 4)
+    fill(sponge[1], [True, False, False, False])
+    assert cli.main(["table", "11", "--no-run", "--episodes", "4", "--only", "task=Sponge"]) == 0
+    page = Path("docs/table11.md").read_text()
+    assert "100.0 (51.0 to 100.0)<br>paper 14 of 20" in page and "–<br>paper 8 of 20" in page
+    assert "25.0 (4.6 to 69.9)<br>paper –" in page and "SpiralMaze" not in page
+    assert "TD3-BC" in page.split("## VELAP against")[1]
+    rows = list(csv.DictReader(Path("results/table11.csv").read_text().splitlines()))
+    (row,) = [row for row in rows if (row["task"], row["method"]) == ("Sponge", "velap")]
+    assert (row["paper_percent"], row["paper_deviation_percent"], row["success_percent"]) == ("70", "", "100.000")
+    assert r"14 of 20" in Path("results/table11-default.tex").read_text()
+    assert not Path("results/table1.csv").exists()
 
 
 # the workflow

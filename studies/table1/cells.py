@@ -1,4 +1,4 @@
-"""The cells of Table 1, and the state of each on disk: dataset, joint checkpoint, head, records."""
+"""The cells of Tables 1 and 11, and the state of each on disk: dataset, joint checkpoint, head, records."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from studies.table1.paper import ROWS
+from studies.table1.paper import ROWS, TASKS_11
 from studies.table1.paper import TASKS as PAPER_TASKS
 from velap.config import Config, describe
 from velap.data import minari_io
@@ -42,8 +42,10 @@ def in_paper_order(names: Sequence[str], order: Sequence[str]) -> tuple[str, ...
     return tuple(sorted(names, key=lambda name: order.index(name) if name in order else len(order)))
 
 
-TASK_ORDER = in_paper_order([name for name in TASKS if name not in {task.name for task in ROBOT_TASKS}], PAPER_TASKS)
-"""Tasks of the table; the robot tasks belong to Table 11."""
+_ROBOT = [task.name for task in ROBOT_TASKS]
+TABLES = {"1": in_paper_order([name for name in TASKS if name not in _ROBOT], PAPER_TASKS),
+          "11": in_paper_order(_ROBOT, TASKS_11)}
+"""Number of a table -> its tasks; those of other packages are in Table 1."""
 METHOD_ORDER = in_paper_order(tuple(METHODS), ROWS)
 
 
@@ -97,13 +99,14 @@ class Cell:
         return record_path(root, self.task, self.method, self.preset, self.seed)
 
 
-def parse_only(filters: Sequence[str] = ()) -> tuple[Cell, ...]:
-    """`["task=SpiralMaze", "method=bc,iql"]` -> the cells; axes that are not named are all tasks, all methods, preset
-    default, seed 0.
+def parse_only(filters: Sequence[str] = (), number: str = "1") -> tuple[Cell, ...]:
+    """`["task=SpiralMaze", "method=bc,iql"]` -> the cells of a table; axes that are not named are all its tasks, all
+    methods, preset default, seed 0.
 
     Raises ConfigError on another form, UnknownTaskError on names that are not registered.
     """
-    known = {"task": TASK_ORDER, "method": METHOD_ORDER, "preset": PRESETS}
+    order = TABLES[number]
+    known = {"task": order, "method": METHOD_ORDER, "preset": PRESETS}
     chosen: dict[str, Sequence[str]] = {**known, "preset": ("default",), "seed": ("0",)}
     named = set()
     for text in filters:
@@ -122,7 +125,7 @@ def parse_only(filters: Sequence[str] = ()) -> tuple[Cell, ...]:
                                        f"{', '.join(known[axis])}. Names are case-sensitive.")
         named.add(axis)
         chosen[axis] = names
-    tasks, methods = in_paper_order(chosen["task"], TASK_ORDER), in_paper_order(chosen["method"], METHOD_ORDER)
+    tasks, methods = in_paper_order(chosen["task"], order), in_paper_order(chosen["method"], METHOD_ORDER)
     seeds = {method: chosen["seed"] if get_method(method).needs_model else ("0",) for method in methods}
     return tuple(Cell(task, method, preset, int(seed)) for task in tasks for preset in chosen["preset"] for method in methods
                  for seed in seeds[method])

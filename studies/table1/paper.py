@@ -1,7 +1,8 @@
-"""Table 1 of the paper, as data.
+"""Tables 1 and 11 of the paper, as data.
 
-Source: VELAP (Value-guided Expansive Latent Planning), CoRL 2023, §5.1, Table 1: "Success rates and std. deviations (%) on
-test cases with unseen object variations (except SpiralMaze)".
+Source: VELAP (Value-guided Expansive Latent Planning), CoRL 2023. §5.1, Table 1: "Success rates and std. deviations (%) on
+test cases with unseen object variations (except SpiralMaze)". App. E.1, Table 11: "Results of physical robot experiments
+(successful episodes)".
 """
 
 from __future__ import annotations
@@ -24,6 +25,16 @@ _ROWS = {
 
 TABLE_1 = {(task, method): cell for task, row in _ROWS.items() for method, cell in zip(METHODS, row, strict=True)}
 """(task, method) -> success rate and its standard deviation over training runs [%]."""
+
+TASKS_11 = ("Sponge", "Rope")
+"""Rows of Table 11, in its order."""
+TRIALS_11 = 20
+"""Episodes of each cell of Table 11, on one robot."""
+TABLE_11 = {
+    ("Sponge", "bc"): 5, ("Sponge", "bc-success"): 6, ("Sponge", "iris"): 6, ("Sponge", "velap"): 14,
+    ("Rope", "bc"): 0, ("Rope", "bc-success"): 0, ("Rope", "iris"): 2, ("Rope", "velap"): 8,
+}
+"""(task, method) -> successful episodes."""
 
 ROWS = ("bc", "bc-success", "td3bc", "iql", "iql-sparse", "mppi", "mbop", "iris", "iris-multistep", "velap", "random")
 """Methods in the order of our tables' rows: those of Table 1 and, beside them, ours."""

@@ -1,4 +1,4 @@
-"""Table 1 from records: a data frame with a row a training seed, and the CSV, LaTeX and Markdown made of it.
+"""Tables 1 and 11 from records: a data frame with a row a training seed, and the CSV, LaTeX and Markdown made of it.
 
 Statistics are `velap.evaluation.summary`'s. Records of another config are left out and named.
 """
@@ -12,8 +12,8 @@ from typing import Any
 
 import pandas as pd
 
-from studies.table1.cells import METHOD_ORDER, TASK_ORDER, Cell, look, training_seconds
-from studies.table1.paper import TABLE_1
+from studies.table1.cells import METHOD_ORDER, TABLES, Cell, look, training_seconds
+from studies.table1.paper import TABLE_1, TABLE_11, TRIALS_11
 from velap.evaluation.records import select
 from velap.evaluation.summary import Episodes, mcnemar, mean_and_spread, summarise
 from velap.methods.base import get_method
@@ -41,6 +41,8 @@ class Results:
     `led_by_plan` [%] and `outcomes`."""
     notes: tuple[str, ...]
     """Records that were left out or are mixed."""
+    number: str = "1"
+    """Of the paper's table."""
 
     @property
     def presets(self) -> list[str]:
@@ -52,26 +54,33 @@ class Results:
         return self.runs[self.runs["preset"] == preset]
 
 
-def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",)) -> Results:
-    """Read all records of the table; it shows `presets` even without records."""
+def gather(root: Path, episodes: int, presets: Sequence[str] = ("default",), number: str = "1") -> Results:
+    """Read all records of the table of that number; it shows `presets` even without records."""
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     for preset in PRESETS:
-        for task in TASK_ORDER:
+        for task in TABLES[number]:
             for method in METHOD_ORDER:
                 found = list(_runs(Cell(task, method, preset, 0), root, episodes, notes))
                 rows += found or [dict(zip(KEY, (task, method, preset), strict=True))]
     runs = pd.DataFrame(rows, columns=[*CSV_COLUMNS, "plans", "led_by_plan", "outcomes"])
     recorded = set(runs[runs["episodes"].notna()]["preset"])
     runs = runs[runs["preset"].isin(recorded | set(presets))].copy()
-    for number, row in runs.iterrows():
+    for place, row in runs.iterrows():
         rates = runs[(runs[KEY] == row[KEY]).all(axis=1)]["success_percent"].dropna()
         mean, spread = mean_and_spread(list(rates)) if len(rates) else (None, None)
-        runs.loc[number, SPREAD] = [len(rates), mean, spread, *TABLE_1.get((row["task"], row["method"]), (None, None))]
+        runs.loc[place, SPREAD] = [len(rates), mean, spread, *_published(row["task"], row["method"])]
     whole = ["train_seed", "episodes", "successes", "seeds", "paper_percent", "paper_deviation_percent"]
     real = [name for name in (*NUMBERS, *SPREAD, *COST) if name not in whole]
     runs = runs.astype(dict.fromkeys(whole, "Int64") | dict.fromkeys(real, float))
-    return Results(runs, (*notes, *_mixed_code(runs), *_mixed_checkpoints(runs), *_missing(runs)))
+    return Results(runs, (*notes, *_mixed_code(runs), *_mixed_checkpoints(runs), *_missing(runs)), number)
+
+
+def _published(task: str, method: str) -> tuple[int | None, int | None]:
+    """The paper's success rate and its deviation [%]; Table 11 has one training."""
+    if (task, method) in TABLE_11:
+        return 100 * TABLE_11[task, method] // TRIALS_11, None
+    return TABLE_1.get((task, method), (None, None))
 
 
 def _runs(cell: Cell, root: Path, episodes: int, notes: list[str]) -> Iterator[dict[str, Any]]:
@@ -113,14 +122,21 @@ def success(runs: pd.DataFrame) -> str:
 
 
 def published(task: str, method: str) -> str:
-    """`94 ± 3` [%] of the paper; a dash for methods that it lacks."""
+    """`94 ± 3` [%] of the paper, or `14 of 20`; a dash for methods that it lacks."""
+    if (task, method) in TABLE_11:
+        return f"{TABLE_11[task, method]} of {TRIALS_11}"
     return "{} ± {}".format(*TABLE_1[task, method]) if (task, method) in TABLE_1 else MISSING
 
 
 def matrix(runs: pd.DataFrame) -> pd.DataFrame:
     """Text of each cell of one preset: methods × tasks."""
     cells = {(task, method): success(group) for (task, method), group in runs.groupby(["task", "method"])}
-    return pd.DataFrame({task: {method: cells[task, method] for method in METHOD_ORDER} for task in TASK_ORDER})
+    return pd.DataFrame({task: {method: cells[task, method] for method in METHOD_ORDER} for task in tasks_of(runs)})
+
+
+def tasks_of(runs: pd.DataFrame) -> list[str]:
+    """Tasks in the order of the table."""
+    return list(dict.fromkeys(runs["task"]))
 
 
 def to_markdown(runs: pd.DataFrame) -> str:
@@ -133,7 +149,7 @@ def to_markdown(runs: pd.DataFrame) -> str:
     return cells.to_markdown()
 
 
-def to_latex(runs: pd.DataFrame, preset: str) -> str:
+def to_latex(runs: pd.DataFrame, preset: str, number: str = "1") -> str:
     """The table in the paper's shape: a row a task with ours, the best in bold, and the paper's below; needs booktabs."""
     ours = matrix(runs).T.map(_latex)
     best = runs.groupby("task")["mean_percent"].max()
@@ -145,7 +161,8 @@ def to_latex(runs: pd.DataFrame, preset: str) -> str:
     both = pd.concat([ours, paper]).loc[[row for task in ours.index for row in (task, f"\\quad paper {task}")]]
     both.columns = pd.Index([_latex(get_method(method).label) for method in both.columns])
     both.index = pd.Index([row if row in ours.index else "\\quad paper" for row in both.index])
-    note = f"% Generated by `velap table 1` from the episode records, preset {preset}. Needs \\usepackage{{booktabs}}.\n"
+    note = (f"% Generated by `velap table {number}` from the episode records, preset {preset}. "
+            "Needs \\usepackage{booktabs}.\n")
     return note + both.to_latex(column_format="l" + "c" * both.shape[1])
 
 
@@ -164,7 +181,7 @@ def planning(runs: pd.DataFrame) -> pd.DataFrame:
     means = velap.groupby("task")[list(columns)].mean()
     means["training_seconds"] /= 60
     means = means.rename(columns=columns)
-    means = means.reindex([task for task in TASK_ORDER if task in means.index])
+    means = means.reindex([task for task in tasks_of(runs) if task in means.index])
     return means.map(lambda value: MISSING if pd.isna(value) else f"{value:.1f}")
 
 
@@ -172,7 +189,7 @@ def comparisons(results: Results) -> pd.DataFrame:
     """VELAP against the baseline with the highest mean rate, the first in the paper's order among equals (McNemar)."""
     rows = []
     for preset in results.presets:
-        for task in TASK_ORDER:
+        for task in tasks_of(results.of(preset)):
             group = results.of(preset)
             group = group[(group["task"] == task) & group["episodes"].notna()]
             velap = _outcomes(group, "velap")

@@ -1,4 +1,4 @@
-"""`velap table 1`: shows the state of the cells, runs the workflow that completes them, and writes the table."""
+"""`velap table 1` and `velap table 11`: the state of the cells, the workflow that completes them, and the table."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ DONE = Path("runs/table1/done")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table1:
+class Table:
     """One call of the command."""
 
+    number: str = "1"
+    """Of the paper's table."""
     cells: tuple[Cell, ...]
     only: str
     """The filters that selected the cells, for the workflow."""
@@ -48,8 +50,8 @@ class Table1:
                               "least one of each.")
         missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
         if missing:
-            raise ConfigError(f"`velap table 1` needs {' and '.join(missing)}; expected the extra `studies`. Install it "
-                              "with `pip install -e '.[studies]'` in the checkout.")
+            raise ConfigError(f"`velap table {self.number}` needs {' and '.join(missing)}; expected the extra `studies`. "
+                              "Install it with `pip install -e '.[studies]'` in the checkout.")
 
     def dry_run(self, console: Console) -> None:
         """Print the state of every cell and the jobs that would run."""
@@ -82,10 +84,12 @@ class Table1:
         from studies.table1.page import results_page
 
         note_training(self.cells)
-        results = tables.gather(self.records, self.episodes, [cell.preset for cell in self.cells])
-        files = {self.records.parent / "table1.csv": tables.to_csv(results), self.page: results_page(results, self.episodes)}
+        results = tables.gather(self.records, self.episodes, [cell.preset for cell in self.cells], self.number)
+        name = f"table{self.number}"
+        files = {self.records.parent / f"{name}.csv": tables.to_csv(results),
+                 self.page: results_page(results, self.episodes)}
         for preset in results.presets:
-            files[self.records.parent / f"table1-{preset}.tex"] = tables.to_latex(results.of(preset), preset)
+            files[self.records.parent / f"{name}-{preset}.tex"] = tables.to_latex(results.of(preset), preset, self.number)
             matrix = tables.matrix(results.of(preset)).to_markdown()
             console.print(f"preset {preset}\n{matrix}", markup=False, soft_wrap=True)
         for path, text in files.items():
@@ -107,8 +111,8 @@ class Table1:
     def _snakemake(self, *options: str) -> int:
         """Run the workflow; its exit code."""
         threads = max(usable_cores() // self.jobs, 1)
-        config = {"records": self.records, "episodes": self.episodes, "batch": self.batch, "page": self.page,
-                  "threads": threads, "fresh": self.fresh, "only": self.only}
+        config = {"number": self.number, "records": self.records, "episodes": self.episodes, "batch": self.batch,
+                  "page": self.page, "threads": threads, "fresh": self.fresh, "only": self.only}
         old = {str(path) for cell in self.cells for path, _ in outdated(cell) if path == dataset_file(cell.task)}
         forced = ["--forcerun", *sorted(old)] if old and self.fresh else []
         command = [sys.executable, "-m", "snakemake", "--snakefile", str(Path(__file__).with_name("Snakefile")),
@@ -144,7 +148,7 @@ def _alone() -> Iterator[int]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise VelapError(f"another `velap table 1` is running here (it holds {path}); expected to be alone. Wait for "
+            raise VelapError(f"another `velap table` is running here (it holds {path}); expected to be alone. Wait for "
                              "it, or stop it and start this one with more --jobs.") from error
         yield lock.fileno()
 

@@ -16,21 +16,22 @@ from velap.errors import ConfigError
 from velap.storage import OWN_RECORDS, SHIPPED_RECORDS
 
 
-def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make Table 1 of the paper.")] = None,
+def table(number: Annotated[Positional[Literal["1", "11"] | None],
+                            arg(help="`1`, `11`: make that table of the paper; 11 has the robot tasks.")] = None,
           records: Path | None = None, write: Path | None = None, only: tuple[str, ...] = (), jobs: int = 2,
           dry_run: bool = False, no_run: bool = False, fresh: bool = False, episodes: int = 100, batch: int = 1) -> None:
-    """Print the statistics of all records; with `1`, run whatever Table 1 still lacks and write it.
+    """Print the statistics of all records; with a number, run whatever that table of the paper still lacks and write it.
 
-    `velap table 1` collects, trains and evaluates every cell that has no records of today's config. Interrupt it at any
-    time: the same command goes on from there.
+    `velap table 1` and `velap table 11` collect, train and evaluate every cell that has no records of today's config.
+    Interrupt them at any time: the same command goes on from there.
 
     Args:
-        records: Root of the episode records. Default: runs/records; with `1` results/records, those of the published
+        records: Root of the episode records. Default: runs/records; with a number results/records, those of the published
             tables.
-        write: Document to update between its table marks, such as docs/records.md; with `1` docs/results.md, or another one
-            to write.
+        write: Document to update between its table marks, such as docs/records.md; with a number docs/results.md or
+            docs/table11.md, or another one to write.
         only: Cells to run, such as `task=SpiralMaze method=bc,iql`. Axes are task, method, preset and seed. Default: all
-            tasks, all methods, preset=default, seed=0.
+            tasks of the table, all methods, preset=default, seed=0.
         jobs: Jobs at once, on one machine; each gets its share of the cores.
         dry_run: Only say what is there, what is missing and which jobs would run.
         no_run: Only write the table from the records that are there.
@@ -40,8 +41,8 @@ def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make
     """
     if number is None:
         if only or dry_run or no_run or fresh or (jobs, episodes, batch) != (2, 100, 1):
-            raise ConfigError("got options of `velap table 1` without the number; expected `velap table 1 ...`, or only "
-                              "--records and --write.")
+            raise ConfigError("got options of `velap table 1` without the number; expected `velap table 1 ...`, `velap "
+                              "table 11 ...`, or only --records and --write.")
         from velap.evaluation.summary import markdown_table, summarise_all, write_into
 
         text = markdown_table(summarise_all(records or OWN_RECORDS))
@@ -51,9 +52,10 @@ def table(number: Annotated[Positional[Literal["1"] | None], arg(help="`1`: make
             write_into(write, text)
             say(f"table written into {write}")
         return
-    one = _study("table1.workflow").Table1(
-        cells=_study("table1.cells").parse_only(only), only=" ".join(only), records=records or SHIPPED_RECORDS,
-        episodes=episodes, batch=batch, jobs=jobs, fresh=fresh, page=write or Path("docs/results.md"))
+    page = write or Path("docs/results.md" if number == "1" else "docs/table11.md")
+    one = _study("table1.workflow").Table(
+        number=number, cells=_study("table1.cells").parse_only(only, number), only=" ".join(only),
+        records=records or SHIPPED_RECORDS, episodes=episodes, batch=batch, jobs=jobs, fresh=fresh, page=page)
     do = one.dry_run if dry_run else one.write if no_run else one.run
     do(OUT)
 
@@ -68,23 +70,28 @@ def bench(json: Path | None = None, only: tuple[str, ...] = (), device: Device =
     _study("speed.command").run_benchmarks(OUT, json, device, only)
 
 
-def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-latents", "server"]],
+def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-latents", "server", "paper"]],
                              arg(help="`faults`: kills, damage, full disks. `experts`: can each task be solved, and not by "
                                       "chance. `exact-latents`: what everything but the encoder can do. "
-                                      "`server`: wrong messages by the thousand.")],
+                                      "`server`: wrong messages by the thousand. `paper`: all its tables and figures.")],
           quick: bool = False, seed: int = 0, write: Path | None = None, json: Path | None = None,
-          task: str = "DrawerButton", settings: Settings = ()) -> None:
-    """Try what may go wrong, whether the tasks can be solved, or true states instead of latents of frames.
+          task: str = "DrawerButton", settings: Settings = (), dry_run: bool = False, fresh: bool = False) -> None:
+    """Try what may go wrong, whether the tasks can be solved, or true states instead of latents of frames; or make every
+    table and figure of the paper, which goes on where it was interrupted.
 
     Args:
         quick: Two kills a command instead of twenty; ten episodes instead of a hundred (fifty on exact latents); 3,000
             messages instead of 100,000.
         seed: Decides the moments of the kills; seed of the experts' first episode; training seed of exact latents.
-        task: Manipulation task of exact latents.
+        task: Task of exact latents.
         write: Document to write, such as docs/faults.md or docs/experts.md.
         json: Figures of the experts or the server go to this file as well, such as results/experts.json.
+        dry_run: Paper: only say what is there, and about how long the rest takes.
+        fresh: Paper: move records of another config aside and make them anew.
     """
-    if subject == "faults":
+    if subject == "paper":
+        _study("paper").make_paper(OUT, dry_run, fresh)
+    elif subject == "faults":
         _study("faults.study").study_faults(OUT, quick, seed, write)
     elif subject == "exact-latents":
         _study("exact_latents").study_exact_latents(OUT, task, parse_settings(settings), seed, quick, json)
@@ -94,17 +101,20 @@ def study(subject: Annotated[Positional[Literal["faults", "experts", "exact-late
         _study("experts").study_experts(OUT, quick, seed, write, json)
 
 
-def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-widowx"]],
+def figure(name: Annotated[Positional[Literal["3", "5", "6", "7", "8", "tasks", "tasks-widowx"]],
                            arg(help="Number of the paper's figure, or a picture of the documentation.")],
-           task: Annotated[Positional[str | None], arg(help="Of figure 3; by default both mazes.")] = None,
+           task: Annotated[Positional[str | None], arg(help="Of figures 3, 5 and 6. Default: both mazes, in 5 and 6 "
+                                                            "WindowClose too.")] = None,
            write: Path | None = None, checkpoint: Path | None = None, dataset: str | None = None,
            image_key: ImageKey = (), device: Device = "auto", episodes: int = 50, no_run: bool = False,
-           fresh: bool = False) -> None:
+           fresh: bool = False, seeds: tuple[int, ...] = (0, 1), updates: tuple[int, int] | None = None,
+           dry_run: bool = False) -> None:
     """Make a figure of the paper, or draw a picture of the documentation anew.
 
-    `3`: the latent space, its values and planned paths. `7` and `8`: success against planning time in SpiralMaze and in
-    ObstacleMaze; interrupt them at any time, the same command goes on from there. `tasks`: test start and success of every
-    task, as an agent sees them. `tasks-widowx`: an expert's episode of each task of the WidowX arm.
+    `3`: the latent space, its values and planned paths. `5`: encoders, and what comes of them. `6`: losses of h, and what
+    comes of them. `7` and `8`: success against planning time in SpiralMaze and in ObstacleMaze. Interrupt 5 to 8 at any
+    time, the same command goes on from there. `tasks`: test start and success of every task, as an agent sees them.
+    `tasks-widowx`: an expert's episode of each task of the WidowX arm.
 
     Args:
         write: The PNG; figures of the paper get a PDF beside it. Default: docs/figures/figNUMBER.png or docs/NAME.png (with
@@ -112,10 +122,13 @@ def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-wid
         checkpoint: Figures 3, 7, 8: `model.safetensors` of a run. Default: the released one.
         dataset: Figure 3: states of this dataset instead of those of an environment seen from above; panels a and c stay
             empty.
-        device: Figure 3: where the networks run.
-        episodes: Figures 7 and 8: episodes a point, seeds from 1000.
+        device: Figures 3, 5, 6: where the networks run.
+        episodes: Figures 5 to 8: episodes a bar or point, seeds from 1000.
         no_run: Only draw what was made before.
-        fresh: Figures 7 and 8: move records of another checkpoint or config aside and make them anew.
+        fresh: Figures 5 to 8: move records of another checkpoint or config aside and make them anew.
+        seeds: Figures 5 and 6: training seeds.
+        updates: Figures 5 and 6: updates on frames, and on frozen latents. Default: those of the default preset.
+        dry_run: Figures 5 and 6: only say which cells are there.
     """
     if name == "3":
         from velap.report.latent_figure import show
@@ -123,8 +136,14 @@ def figure(name: Annotated[Positional[Literal["3", "7", "8", "tasks", "tasks-wid
         show(OUT, task, checkpoint=checkpoint, dataset=dataset, image_key=joined(image_key), device=device, no_run=no_run,
              write=write)
         return
+    if name in ("5", "6"):
+        ablations, kind = _study("ablations"), _study("representation" if name == "5" else "dynamics_loss")
+        plan = ablations.Plan(study=kind.STUDY, tasks=ablations.TASKS if task is None else (task,), seeds=seeds,
+                              updates=updates, episodes=episodes, device=device)
+        ablations.show(OUT, plan, write or Path(f"docs/figures/fig{name}.png"), dry_run=dry_run, no_run=no_run, fresh=fresh)
+        return
     if task is not None:
-        raise ConfigError(f"`velap figure {name}` got the task {task!r}; only figure 3 takes one. Leave it out.")
+        raise ConfigError(f"`velap figure {name}` got the task {task!r}; only figures 3, 5 and 6 take one. Leave it out.")
     if name in ("7", "8"):
         _study("planning_time").show_planning_time(
             OUT, name, write or Path(f"docs/figures/fig{name}.png"), checkpoint=checkpoint, episodes=episodes, no_run=no_run,
