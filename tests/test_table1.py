@@ -175,13 +175,15 @@ def test_checkpoints_of_another_config_are_outdated() -> None:
 # the tables
 
 
-def test_the_tables_are_those_that_are_committed_cell_by_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("number", TABLES)
+def test_the_tables_are_those_that_are_committed_cell_by_cell(number: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    results = tables.gather(RECORDS, 100)
-    ours, committed = (pd.read_csv(file) for file in (io.StringIO(tables.to_csv(results)), "results/table1.csv"))
+    results = tables.gather(RECORDS, 100, number=number)
+    ours, committed = (pd.read_csv(file) for file in (io.StringIO(tables.to_csv(results)), f"results/table{number}.csv"))
     pd.testing.assert_frame_equal(ours, committed)
     for preset in results.presets:
-        assert tables.to_latex(results.of(preset), preset) == Path(f"results/table1-{preset}.tex").read_text()
+        written = Path(f"results/table{number}-{preset}.tex").read_text()
+        assert tables.to_latex(results.of(preset), preset, number) == written
 
 
 def test_mcnemar_is_the_exact_binomial_test_of_the_discordant_pairs() -> None:
