@@ -58,15 +58,15 @@ class Point:
         return "-".join(map(str, self.settings))
 
     def changes(self) -> dict[str, dict[str, Any]]:
-        """Fields of the checkpoint's config to replace. VELAP runs as Algorithms 1 and 2 have it: no proposers, π^l without
-        lookahead. τ_low grows with n_sim as in the mazes' presets; MPPI keeps a quarter of its samples, 64 at most
+        """Fields of the checkpoint's config to replace. VELAP runs as Algorithms 1 and 2 have it: no proposers. τ_low
+        grows with n_sim as in the mazes' presets; MPPI keeps a quarter of its samples, 64 at most
         (D.4)."""
         first, second, third = self.settings
         if self.method == "mppi":
             return {"mppi": {"iterations": first, "horizon": second, "samples": third, "elites": min(64, third // 4)}}
         return {"planner": {"provenance": False, "n_iter": first, "n_sim": second, "candidates": third,
                             "discard_low_exponent": 2.0 * second},
-                "controller": {"n_replan": N_REPLAN[self.task], "lookahead": 0}}
+                "controller": {"n_replan": N_REPLAN[self.task]}}
 
     def run(self, checkpoint: Path, records: Path, seeds: range, fresh: bool) -> None:
         """Run the missing episodes one at a time, so that a plan has the machine to itself."""

@@ -22,7 +22,7 @@ def reference_plan(fns: SearchFns, root: torch.Tensor, cfg: PlannerConfig, noise
     nodes, parents, values, steps, counts, expansions = [root], [-1], [float(fns.value(root))], [0.0], [0], [0]
     for i in range(cfg.n_iter):
         if i % cfg.candidates == 0:
-            crowding = [n + cfg.expansion_weight * e for n, e in zip(counts, expansions, strict=True)]
+            crowding = [n + e * (cfg.anchor == "snap") for n, e in zip(counts, expansions, strict=True)]
             sparse = [math.exp(-n / TEMPERATURE_SPARSE) for n in crowding]
             value = [math.exp(q / TEMPERATURE_VALUE) for q in values]
             uniform = 1 - cfg.p_sparse - cfg.p_value

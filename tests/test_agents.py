@@ -103,11 +103,16 @@ def test_waypoints_are_passed_when_reached_several_at_once() -> None:
     assert agent.plans.ahead(0).tolist() == [[-4.0, 9.0]], "the last waypoint stays"
 
 
-@pytest.mark.parametrize(("lookahead", "gets_there"), [(0, False), (3, True)])
-def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: int, gets_there: bool) -> None:
-    model = ToyModel()
+def snapping(**changes: object) -> ToyModel:
+    """A model whose search snaps, to where its candidates are."""
+    return ToyModel(snaps=True, project=lambda z: (z, z.new_zeros(z.shape[:-1])), **changes)
+
+
+@pytest.mark.parametrize(("anchor", "gets_there"), [("none", False), ("auto", True)])
+def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(anchor: str, gets_there: bool) -> None:
+    model = snapping()
     model.act_local = lambda latent, goal: (goal - latent) / (goal - latent).norm(dim=-1, keepdim=True)  # blind to the wall
-    agent = VelapAgent(model, override(toy_config(n_iter=1), controller={"lookahead": lookahead, "n_replan": 100}))
+    agent = VelapAgent(model, override(toy_config(n_iter=1, anchor=anchor), controller={"n_replan": 100}))
     env = ToyEnv()
     env.reset(seed=0)
     env.set_agent_position(np.array([-0.5, 3.0]))
@@ -121,15 +126,17 @@ def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(lookahead: in
     assert (env.agent_position()[0] > 0) == gets_there
 
 
-def test_the_lookahead_takes_a_stronger_action_where_it_comes_nearer() -> None:
-    model = ToyModel(propose=lambda z, noise: torch.zeros_like(z))
+@pytest.mark.parametrize(("anchor", "snaps", "strength"), [
+    ("none", True, 0.3), ("auto", False, 0.3), ("auto", True, 0.6), ("snap", False, 0.6)])
+def test_where_the_search_snaps_a_stronger_action_wins_that_comes_nearer(anchor: str, snaps: bool, strength: float) -> None:
+    model = snapping(propose=lambda z, noise: torch.zeros_like(z))
+    model._fns = model._fns._replace(snaps=snaps)
     model.act_local = lambda latent, goal: 0.3 * (goal - latent) / (goal - latent).norm(dim=-1, keepdim=True)
-    for gain, strength in ((1.0, 0.3), (2.0, 0.6), (10.0, 1.0)):
-        agent = VelapAgent(model, override(toy_config(n_iter=1), controller={"lookahead_gain": gain, "n_replan": 100}))
-        agent.act(frames_at(START))
-        with torch.inference_mode():
-            set_plan(agent, [START, (START[0], START[1] + 9.0)])
-        np.testing.assert_allclose(agent.act(frames_at(START))[0], [0.0, ACTION_SCALE * strength], atol=0.03)
+    agent = VelapAgent(model, override(toy_config(n_iter=1, anchor=anchor), controller={"n_replan": 100}))
+    agent.act(frames_at(START))
+    with torch.inference_mode():
+        set_plan(agent, [START, (START[0], START[1] + 9.0)])
+    np.testing.assert_allclose(agent.act(frames_at(START))[0], [0.0, ACTION_SCALE * strength], atol=0.03)
 
 
 def test_plan_of_the_root_alone_leaves_it_to_the_global_policy() -> None:

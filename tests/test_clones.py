@@ -13,10 +13,16 @@ from velap.config import Config
 from velap.errors import DatasetError
 from velap.models.arrivals import arrivals
 from velap.models.checkpoint import load_checkpoint
-from velap.training.clone import Best, arrival_rate, fresh
+from velap.training.clone import Best, arrival_rate, fresh, measure_arrivals
 from velap.training.loop import Trainer
 
 GOAL = 0.9
+
+
+@pytest.fixture(autouse=True)
+def few_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clones are judged from fewer states than data have."""
+    monkeypatch.setattr("velap.training.clone.STATES", 60)
 
 
 def value(z: torch.Tensor) -> torch.Tensor:
@@ -107,6 +113,22 @@ def test_the_clone_phase_moves_the_policy_of_successes_alone_towards_their_actio
     assert len(learner.rows) == 12 and last < 0.7 * first, "noise, learnt by heart"
     loaded, _, _ = load_checkpoint(run.finish("x").checkpoint)
     assert loaded.search_fns().act_success(torch.zeros(2, SMALL.latent_dim)).shape == (2, 3)
+
+
+def test_a_finished_training_knows_whether_the_clone_or_the_policy_gets_to_the_goal_more_often(tmp_path) -> None:
+    run = to_end(make(tmp_path, cloning(3, 1)))
+    run.model.global_policy.requires_grad_(False)
+    with torch.no_grad():
+        for policy, way in ((run.model.global_policy, -1.0), (run.model.success_policy, 1.0)):
+            last = list(policy)[-1]
+            last.weight.zero_()
+            last.bias.fill_(20 * way)
+    run.model.step = lambda z, a: z + 0.1 * a.mean(-1, keepdim=True)  # type: ignore[method-assign]
+    run.model.value = lambda z: torch.sigmoid(z.mean(-1))  # type: ignore[method-assign]
+    measure_arrivals(run.model, run.sampler, torch.Generator().manual_seed(0))
+    assert run.model.arrival_rates.tolist() == [0.0, 1.0]
+    loaded, _, _ = load_checkpoint(run.finish("x").checkpoint)
+    assert loaded.search_fns().arrival_rates == tuple(run.model.arrival_rates.tolist()) == (0.0, 1.0)
 
 
 def test_whole_successful_episodes_are_cloned(tmp_path) -> None:

@@ -71,13 +71,21 @@ def test_a_file_of_schema_2_loses_what_only_acted() -> None:
     assert sum(isinstance(phase, EnsemblePhase) for phase in config.train.phases) == 1, "the held policy's members went too"
 
 
+def test_a_default_file_of_schema_3_acts_as_today() -> None:
+    whole = make_config("DrawerButton").to_dict()
+    whole["planner"] |= {"provenance": True, "p_sparse": 0.9, "p_value": 0.1}
+    whole["controller"] |= {"lookahead": 3, "lookahead_gain": 2.0}
+    assert read({**whole, "schema": 3}) == make_config("DrawerButton")
+    with pytest.raises(ConfigError, match="schema 3"):
+        read({**whole, "schema": 3, "train": {}})
+
+
 def test_the_paper_preset_keeps_its_planner_and_controller() -> None:
     raw = schema_2("paper")
     assert read(raw) == make_config("DrawerButton", "paper")
     raw["planner"]["n_iter"], raw["controller"]["n_replan"] = 77, 9
     changed = read(raw)
     assert (changed.planner.n_iter, changed.controller.n_replan, changed.planner.provenance) == (77, 9, False)
-    assert (changed.controller.lookahead, changed.controller.lookahead_gain) == (0, 1.0)
 
 
 @pytest.mark.parametrize("change", [{"train": {}}, {"train": {"phases": [4]}}, {"planner": None, "preset": "paper"}])

@@ -12,7 +12,7 @@ from toy_env import ACTION_SCALE, ToyEnv, ToyModel, draw, toy_config
 from toy_world import GOAL, START, TIP, crosses_wall, geodesic, move, roots, row_generators, straight_to_goal, toy_fns
 from velap.config.planning import PlannerConfig
 from velap.methods.base import make_agent
-from velap.methods.provenance import PATIENCE, ProvenanceAgent
+from velap.methods.provenance import PATIENCE, ProvenanceAgent, proposers_of, search_of
 from velap.methods.tree_agent import Actor
 from velap.methods.velap import VelapAgent, VelapSettings
 from velap.registry import PLANNERS
@@ -155,6 +155,23 @@ def test_an_edge_of_g_that_is_not_walked_in_time_ends_the_plan() -> None:
         agent.act(frames_at(START))
         planned.append(bool(np.isfinite(agent.last_plan_ms).any()))
     assert planned.index(True) == patience - 1
+
+
+@pytest.mark.parametrize(("rates", "expected"), [
+    ((0.4, 0.9), [Actor.CLONE]), ((0.9, 0.4), [Actor.POLICY]), ((0.0, 0.0), [Actor.POLICY, Actor.CLONE])])
+def test_who_gets_to_the_goal_more_often_by_h_proposes(rates: tuple[float, float], expected: list[Actor]) -> None:
+    fns = toy_fns(act_success=straight_to_goal, arrival_rates=rates)
+    assert [each.actor for each in proposers_of(fns)] == expected
+    assert [each.actor for each in proposers_of(fns._replace(act_success=None))] == [Actor.POLICY]
+
+
+@pytest.mark.parametrize(("share", "kind"), [(0.039, VelapAgent), (0.04, ProvenanceAgent)])
+def test_where_the_config_leaves_it_open_the_share_of_successes_in_the_data_decides(share: float, kind: type) -> None:
+    model, config = ToyModel(success_share=share), toy_config(provenance=None)
+    agent = make_agent("velap", model, config, ToyEnv().action_space)  # type: ignore[arg-type]
+    assert type(agent) is kind
+    found = search_of(model, config)(roots(1), row_generators(1))  # type: ignore[arg-type]
+    assert isinstance(found, Provenance) == (kind is ProvenanceAgent)
 
 
 def test_the_config_and_the_planner_decide_which_agent_acts(monkeypatch: pytest.MonkeyPatch) -> None:

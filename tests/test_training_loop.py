@@ -39,11 +39,14 @@ def test_a_training_without_joint_phase_resumes_to_the_same_bits(tmp_path, stop)
 
 
 def test_train_writes_a_loadable_model_and_readable_metrics(tmp_path):
-    seen = []
-    result = train(config(), make_store(), tmp_path, device="cpu", on_progress=seen.append, command="velap train test")
+    seen, store = [], make_store()
+    result = train(config(), store, tmp_path, device="cpu", on_progress=seen.append, command="velap train test")
     model, loaded, metadata = load_checkpoint(result.checkpoint)
     assert loaded == config() and metadata["command"] == "velap train test" and metadata["dataset_hash"] == "abc"
     assert Reading.from_json(metadata["reading"]) == make_store().reading
+    assert model.success_share == pytest.approx(np.mean([
+        store.rewards[first : first + length].any()
+        for first, length in zip(store.episode_start, store.episode_length, strict=True)]))
     assert result.checkpoint.name == MODEL and model.step_distance > 0 and (model.bank_rows >= 0).all()
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [2, 4, 6, 8, 10, 12]

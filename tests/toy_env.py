@@ -81,6 +81,7 @@ class ToyModel(nn.Module):
         super().__init__()
         self.anchor = nn.Parameter(torch.zeros(1, dtype=torch.float64))
         self._fns = toy_fns(**changes)
+        self.success_share = self._fns.success_share
         axis = torch.arange(-9.0, 10.0, 3.0)
         self.bank_latents = torch.cartesian_prod(axis, axis)
         self.bank_rows = torch.arange(len(self.bank_latents))
@@ -119,7 +120,7 @@ def toy_config(**planner: object) -> Config:
     """Config for the toy world: Algorithms 1 and 2, replanning every 10 steps; `planner` replaces fields of the search."""
     base = Config(task="toy", preset="default")
     settings = vars(algorithm_1(n_iter=60, n_sim=3, candidates=20)) | planner
-    return override(base, planner=settings, controller={"n_replan": 10, "lookahead_gain": 1.0},
+    return override(base, planner=settings, controller={"n_replan": 10},
                     model={"frame_stack": 2})
 
 

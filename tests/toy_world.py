@@ -88,8 +88,8 @@ def toy_fns(**changes: object) -> SearchFns:
 def algorithm_1(**changes: Any) -> PlannerConfig:
     """Algorithm 1 without what is ours but coherent noise; `changes` replaces fields."""
     plain: dict[str, Any] = {
-        "provenance": False, "n_iter": 250, "n_sim": 5, "candidates": 50, "discard_low_exponent": None, "p_sparse": 0.4,
-        "p_value": 0.4, "expansion_weight": 0.0, "anchor": "none"}
+        "provenance": False, "n_iter": 250, "n_sim": 5, "candidates": 50, "discard_low_exponent": None,
+        "anchor": "none"}
     return PlannerConfig(**{**plain, **changes})
 
 

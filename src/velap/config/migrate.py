@@ -1,4 +1,5 @@
-"""Configs of older schemas, read as today's. Schema 1 is velap 0.1's, schema 2 that of its successors before one search.
+"""Configs of older schemas, read as today's. Schema 1 is velap 0.1's, schema 2 that of its successors before one search,
+schema 3 that of the one search with settings for lookahead and crowding.
 
 What a training made is kept. How it acts is today's: planner and controller of older files have today's defaults, and
 mechanisms that only acted at run time are left out, with the policies that only they used. Files of the preset `paper` keep
@@ -77,11 +78,12 @@ DISTIL = 3_000
 
 
 def from_older(raw: dict[str, Any]) -> Config:
-    """Today's config from parsed JSON of schema 1 or 2; raises ConfigError where it names what today's velap cannot do."""
-    return _from_v1(raw) if "schema" not in raw else _from_v2(raw)
+    """Today's config from parsed JSON of schema 1, 2 or 3; raises ConfigError where it names what today's velap cannot
+    do."""
+    return _from_v1(raw) if "schema" not in raw else _from_later(raw)
 
 
-def _from_v2(raw: dict[str, Any]) -> Config:
+def _from_later(raw: dict[str, Any]) -> Config:
     try:
         train = raw["train"]
         phases = [{name: value for name, value in phase.items() if name not in ("hold", "reach")}
@@ -89,8 +91,8 @@ def _from_v2(raw: dict[str, Any]) -> Config:
         planner, controller = _acting(raw)
         today = {**raw, "train": {**train, "phases": phases}, "planner": planner, "controller": controller}
     except (KeyError, AttributeError, TypeError) as error:
-        raise ConfigError(f"the config of schema 2 lacks parts or has others than it should ({error!r}); expected a config "
-                          "that velap saved. Restore the file.") from error
+        raise ConfigError(f"the config of schema {raw['schema']} lacks parts or has others than it should ({error!r}); "
+                          "expected a config that velap saved. Restore the file.") from error
     del today["schema"]
     config: Config = build(Config, today, "config")
     return config

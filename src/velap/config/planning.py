@@ -15,14 +15,18 @@ SNAP_GAP = 0.5
 """Where `auto` anchors, most held-out latents lie nearer to the bank than this [one-step distances]. ours: an anchor then
 moves a candidate by less than half a step and undoes errors of h that lead nowhere real. Where the bank has wider gaps,
 anchors move candidates by as much as a step does."""
+RARE_SUCCESS = 0.04
+"""Where fewer of the data's episodes succeed than this, edges have no proposer unless the config says so. ours: a policy
+that learnt from so few successes proposes nothing better than g does (docs/experiments/2026-11-one-search.md)."""
 
 
 @dataclass(frozen=True)
 class PlannerConfig:
     """Tree search (Algorithm 1, Eq. 6-8, Table 8, App. B.6). Thresholds on Q are given as exponents of γ, as in Table 8."""
 
-    provenance: bool = True
-    """Edges remember what proposed them and are walked by it; those of g carry a risk. ours; off in `paper`."""
+    provenance: bool | None = None
+    """Edges remember what proposed them and are walked by it; those of g carry a risk. ours; off in `paper`. null: where at
+    least 4 % of the data's episodes succeed."""
     n_iter: int = 500
     """Expansions a plan, Table 8 (250 in the other tasks than ButtonWall). Counts candidates, not rounds."""
     n_sim: int = 10
@@ -37,31 +41,33 @@ class PlannerConfig:
     """τ_neigh = γ^this, Table 8."""
     goal_exponent: float = 5.0
     """τ_goal = γ^this, Table 8."""
-    p_sparse: float = 0.9
-    """p^sparse of the node sampling mixture. ours: the paper gives no number; 0.4 in `paper`."""
-    p_value: float = 0.1
-    """p^value of the node sampling mixture; the rest is uniform. ours; 0.4 in `paper`."""
+    p_sparse: float = 0.4
+    """p^sparse, the share of Eq. 6 in P_node. ours: the paper gives no number."""
+    p_value: float = 0.4
+    """p^value, the share of Eq. 7 in P_node; the rest is uniform. ours: the paper gives no number."""
     p_policy: float = 0.2
     """p^policy: probability that an expansion acts by π^g instead of g. ours: Table 8 leaves it out. No effect with
     `provenance`, where the policies have half of a round."""
-    expansion_weight: float = 1.0
-    """Each expansion made from a node counts as this many neighbours in Eq. 6, so that explored surroundings are left alone.
-    ours; 0 in `paper`."""
     coherent_noise: bool = True
     """Draw the action noise once a simulation instead of once a step (the data are correlated walks). ours; off in
     `paper`."""
     anchor: Anchor = "auto"
-    """`snap` moves a candidate to its nearest dataset latent and rejects one that is too far from it; `auto` snaps where
-    held-out latents lie within half a one-step distance of the bank. ours; `none` in `paper`."""
+    """`snap` moves a candidate to its nearest dataset latent and rejects one that is too far from it. Expansions then crowd
+    the node they were made from as neighbours do, since they come to the same few latents, and π^l looks ahead by h. `auto`
+    snaps where held-out latents lie within half a one-step distance of the bank. ours; `none` in `paper`."""
 
     def __post_init__(self) -> None:
         for name in ("n_iter", "n_sim", "candidates"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        require(self.expansion_weight >= 0, "expansion_weight", self.expansion_weight, "a weight of 0 or more")
         for name in ("p_sparse", "p_value", "p_policy"):
             require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
         require(self.p_sparse + self.p_value <= 1 + 1e-9, "p_sparse + p_value", self.p_sparse + self.p_value, "at most 1")
         require(self.anchor in get_args(Anchor), "anchor", self.anchor, f"one of {get_args(Anchor)}")
+
+
+def has_provenance(config: PlannerConfig, success_share: float) -> bool:
+    """Whether edges remember their proposer, for a model of data of which this share of the episodes succeeds."""
+    return success_share >= RARE_SUCCESS if config.provenance is None else config.provenance
 
 
 @dataclass(frozen=True)
@@ -74,14 +80,6 @@ class ControllerConfig:
     """τ_stop = γ^this: π^g takes over, Table 9."""
     waypoint_exponent: float = 3.0
     """τ_wp = γ^this: on to the next waypoint, Table 9."""
-    lookahead: int = 3
-    """π^l competes with actions sampled from g, each held for this many simulated steps and judged by Q_min to the waypoint;
-    0 acts by π^l alone [steps]. ours: π^l pushes into walls at corners that h knows of; 0 in `paper`."""
-    lookahead_gain: float = 2.0
-    """Above 1, the actions of the lookahead also compete multiplied by this and clipped to the limits. ours: g and π^l are
-    as slow as the data; 1 in `paper`."""
 
     def __post_init__(self) -> None:
         require(self.n_replan >= 1, "n_replan", self.n_replan, "at least 1 step")
-        require(self.lookahead >= 0, "lookahead", self.lookahead, "0 or more steps")
-        require(self.lookahead_gain >= 1, "lookahead_gain", self.lookahead_gain, "a factor of 1 or more")

@@ -59,9 +59,9 @@ def paper(task: str) -> Config:
             phases=(JointPhase(24_000, rewarded_share=0.0, c1=row.c1, windows=64, window=1),),
             c3=row.c3, target_rate=0.005, policy_every=1),
         PlannerConfig(provenance=False, n_iter=row.n_iter, n_sim=row.n_sim, candidates=50, discard_high_exponent=2.0,
-                      discard_low_exponent=None, neighbour_exponent=3.0, goal_exponent=5.0, p_sparse=0.4, p_value=0.4,
-                      p_policy=0.2, expansion_weight=0.0, coherent_noise=False, anchor="none"),
-        ControllerConfig(n_replan=row.n_replan, stop_exponent=5.0, waypoint_exponent=3.0, lookahead=0, lookahead_gain=1.0),
+                      discard_low_exponent=None, neighbour_exponent=3.0, goal_exponent=5.0,
+                      p_policy=0.2, coherent_noise=False, anchor="none"),
+        ControllerConfig(n_replan=row.n_replan, stop_exponent=5.0, waypoint_exponent=3.0),
     )
 
 

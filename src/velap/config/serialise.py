@@ -14,7 +14,7 @@ from velap.config.planning import ControllerConfig, PlannerConfig
 from velap.config.training import PHASES, Phase, TrainConfig
 from velap.errors import ConfigError
 
-SCHEMA = 3
+SCHEMA = 4
 """Number of the JSON layout. `velap.config.migrate` reads older files."""
 CADENCES = ("log_every", "checkpoint_every")
 """Fields of `TrainConfig` that decide no result and stay out of the hash."""
@@ -71,7 +71,7 @@ class Config:
             raise ConfigError(f"the config is not JSON ({error}); expected the text that velap saved. Restore the "
                               "file.") from error
         schema = raw.get("schema", 1) if isinstance(raw, dict) else None
-        if schema in (1, 2):
+        if schema in (1, 2, 3):
             from velap.config.migrate import from_older
 
             return from_older(raw)

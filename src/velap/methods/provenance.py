@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from velap.config.planning import has_provenance
 from velap.methods.tree_agent import Actor, TreeAgent
 from velap.models.horizon import steps_from_q
 from velap.search import est, provenance
@@ -38,15 +39,21 @@ class Proposer(NamedTuple):
 
 
 def proposers_of(fns: SearchFns) -> tuple[Proposer, ...]:
-    """What proposes besides g: π^g, and the policy cloned from successes where the model has one."""
-    cloned = () if fns.act_success is None else (Proposer(Actor.CLONE, fns.act_success),)
-    return (Proposer(Actor.POLICY, fns.act_global), *cloned)
+    """What proposes besides g: π^g, or the policy cloned from successes, whichever gets to the goal more often by h; both
+    where h cannot tell."""
+    learnt = Proposer(Actor.POLICY, fns.act_global)
+    if fns.act_success is None:
+        return (learnt,)
+    cloned, (by_learnt, by_clone) = Proposer(Actor.CLONE, fns.act_success), fns.arrival_rates
+    if by_learnt == by_clone:
+        return learnt, cloned
+    return (learnt,) if by_learnt > by_clone else (cloned,)
 
 
 def search_of(model: LatentModel, config: Config, fns: SearchFns | None = None) -> Callable[[Tensor, RowGenerator], Plan]:
     """The search that a config asks for: latents [P, D] and a generator a row → plans. `fns`: those of the model."""
     fns = model.search_fns() if fns is None else fns
-    if not config.planner.provenance:
+    if not has_provenance(config.planner, fns.success_share):
         return lambda z, generator: est.plan(fns, z, config.planner, generator)
     policies = [each.policy for each in proposers_of(fns)]
     return lambda z, generator: provenance.plan(fns, z, config.planner, generator, policies=policies)

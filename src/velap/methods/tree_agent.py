@@ -73,7 +73,7 @@ class TreeAgent(ABC):
         self._n_replan = config.controller.n_replan
         self._stop_value = q_from_steps(config.controller.stop_exponent, self._fns.discount)
         self._reached_value = q_from_steps(config.controller.waypoint_exponent, self._fns.discount)
-        self._local_policy = local_policy_of(config.controller, model)
+        self._local_policy = local_policy_of(config.planner, model, self._fns)
         self._device = next(model.parameters()).device
         self._generators: list[torch.Generator] = []
         self._latents = torch.empty(0, 0)

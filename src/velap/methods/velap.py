@@ -1,7 +1,7 @@
 """VELAP. Its controller follows Algorithm 2 with the settings of Table 9 (App. B.7), vectorised over environments.
 
 Where the config's edges remember their proposers, `velap.methods.provenance` searches and acts. Here is Algorithm 2 as it is
-printed, with lookahead in place of π^l alone where the config asks for it.
+printed, with lookahead in place of π^l alone where the search snaps.
 
 B environments, N stacked frames, D latent dimensions, A action dimension.
 """
@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from velap.config.planning import has_provenance
 from velap.methods.base import Agent, Learnt, Method, Parts
 from velap.methods.provenance import ProvenanceAgent
 from velap.methods.tree_agent import Actor, TreeAgent
@@ -77,7 +78,8 @@ class Velap(Method):
 
     def agent(self, parts: Parts) -> Agent:
         """The MPC loop around the search."""
-        if parts.config.planner.provenance and parts.settings.planner == OWN_PLANNER:
+        share = float(parts.model.success_share)
+        if has_provenance(parts.config.planner, share) and parts.settings.planner == OWN_PLANNER:
             return ProvenanceAgent(parts.model, parts.config)
         return VelapAgent(parts.model, parts.config, PLANNERS[parts.settings.planner])
 

@@ -29,7 +29,7 @@ SHARED_SHA256 = "shared_sha256"
 SHARED = ("encoder.", "command_weight", "action_", "dynamics.", "global_policy.", "global_critic.")
 """Beginnings of the names of weights that heads and other methods act by: φ, g, h, π^g and Q^g; `action_` is g and the
 bounds."""
-YOUNGER = ("bank_gap",)
+YOUNGER = ("bank_gap", "success_share", "arrival_rates")
 """Tensors that the first files lack."""
 FORMER = "held_policy."
 """Beginning of the names of tensors that older files have and today's models do not."""

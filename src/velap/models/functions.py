@@ -36,6 +36,10 @@ class SearchFns(NamedTuple):
     """Upper 5-percentile of the distances between subsequent encodings [latent distance]."""
     project: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None
     """Latents [*, D] → nearest dataset latent [*, D] and its distance [*]; None where the model keeps no bank."""
+    success_share: float = 1.0
+    """Share of the data's episodes that succeed; see `velap.config.planning.has_provenance`."""
+    arrival_rates: tuple[float, float] = (0.0, 0.0)
+    """How often π^g and `act_success` get to the goal by h from far away: who of them proposes edges (ours)."""
     snaps: bool = False
     """Anchors of the search move its candidates to `project` where its config leaves that to the model (ours)."""
     act_success: Callable[[Tensor], Tensor] | None = None

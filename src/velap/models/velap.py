@@ -80,6 +80,8 @@ class LatentModel(nn.Module):
         self.register_buffer("action_high", torch.tensor(spaces.action_high))
         self.register_buffer("step_distance", torch.tensor(0.0))
         self.register_buffer("bank_gap", torch.tensor(torch.inf))
+        self.register_buffer("success_share", torch.tensor(1.0))
+        self.register_buffer("arrival_rates", torch.zeros(2))
         # Half precision is a thousandth of a one-step distance and keeps a released checkpoint below 3 MB.
         self.register_buffer("bank_latents", torch.zeros(config.bank_size, latent, dtype=torch.float16))
         self.register_buffer("bank_rows", torch.full((config.bank_size,), -1, dtype=torch.int32))
@@ -91,6 +93,11 @@ class LatentModel(nn.Module):
         """float32 [], upper 5-percentile of one-step distances in the data [latent distance]."""
         self.bank_gap: Tensor
         """float32 [], how far most held-out latents are from the bank [`step_distance`]."""
+        self.success_share: Tensor
+        """float32 [], share of the data's episodes that succeed."""
+        self.arrival_rates: Tensor
+        """float32 [2], share of the states far from the goal from where π^g and the cloned policy get there by h; zeros
+        where there is no clone."""
         self.bank_latents: Tensor
         self.bank_rows: Tensor
 

@@ -17,7 +17,7 @@ from velap.models.horizon import q_from_steps, steps_from_q
 from velap.registry import register_planner
 from velap.search.neighbours import candidate_neighbours, first_come, gained_neighbours, incoming_q
 from velap.search.sampling import Noise, draw_noise, node_distribution, sample_nodes
-from velap.search.simulation import anchored, packs, simulate, value_where
+from velap.search.simulation import anchored, packs, simulate, snaps, value_where
 from velap.search.tree import Candidates, free_slots, insert_, new_tree, take, trace_back, trimmed
 from velap.search.types import Plan, Rejections, RowGenerator, SearchFns, Tree
 from velap.threads import one_thread
@@ -70,8 +70,8 @@ def expand_(tree: Tree, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, 
     """
     used = torch.arange(slots, device=tree.size.device) < tree.size.unsqueeze(1)
 
-    # Alg. 1, l. 4: sample z_exp from V given P_node. Expansions made from a node crowd it like neighbours (ours).
-    crowding = tree.neighbour_counts[:, :slots] + cfg.expansion_weight * tree.expansions[:, :slots]
+    # Alg. 1, l. 4: sample z_exp from V given P_node.
+    crowding = crowding_of(tree, slots, fns, cfg)
     distribution = node_distribution(crowding, tree.goal_values[:, :slots], used, cfg)  # Eq. 6, 7
     parents = sample_nodes(distribution, noise.node, tree.size)
     tree.expansions.scatter_add_(1, parents, torch.ones_like(parents))
@@ -99,6 +99,13 @@ def expand_(tree: Tree, fns: SearchFns, cfg: PlannerConfig, limits: Thresholds, 
     values = value_where(fns, z_new, accepted)
     insert_(tree, Candidates(z_new, parents, values, root_steps, gained[:, slots:]), target)
     return Verdict(accepted, supported, q_edge, std_edge)
+
+
+def crowding_of(tree: Tree, slots: int, fns: SearchFns, cfg: PlannerConfig) -> Tensor:
+    """n^neigh of Eq. 6 for the first slots [B, slots]. Where candidates snap, expansions made from a node count as well
+    (ours): they come to the few latents around it, and most are refused."""
+    counts = tree.neighbour_counts[:, :slots]
+    return counts + tree.expansions[:, :slots] if snaps(fns, cfg) else counts
 
 
 def choose_leaf(tree: Tree, goal_threshold: Tensor | float) -> tuple[Tensor, Tensor]:

@@ -20,7 +20,7 @@ from torch.nn import functional as F
 
 from velap.config.planning import PlannerConfig
 from velap.models.horizon import steps_from_q
-from velap.search.est import Thresholds, Verdict, count_rejections, thresholds
+from velap.search.est import Thresholds, Verdict, count_rejections, crowding_of, thresholds
 from velap.search.neighbours import candidate_neighbours, first_come, gained_neighbours, incoming_q
 from velap.search.sampling import Noise, draw_noise, node_distribution, sample_nodes
 from velap.search.simulation import anchored, simulate, value_where
@@ -149,8 +149,8 @@ def _expand(grown: _Growing, fns: SearchFns, cfg: PlannerConfig, limits: Thresho
 
     parents, proposers = _policy_parents(grown, used, own)
     share = noise.part(own, count)
-    crowding = tree.neighbour_counts[:, :slots] + cfg.expansion_weight * tree.expansions[:, :slots]
     values = tree.goal_values[:, :slots] * discount ** grown.risk[:, :slots]
+    crowding = crowding_of(tree, slots, fns, cfg)
     by_g = sample_nodes(node_distribution(crowding, values, used, cfg), share.node, tree.size)  # Alg. 1, l. 4
     tree.expansions.scatter_add_(1, by_g, torch.ones_like(by_g))
     z_exp = take(tree.latents, parents)

@@ -56,9 +56,14 @@ def _simulate_packed(fns: SearchFns, z: Tensor, noise: Tensor, by_policy: Tensor
     return torch.empty_like(rows).index_copy_(0, order, rows).view_as(z)
 
 
+def snaps(fns: SearchFns, cfg: PlannerConfig) -> bool:
+    """Whether candidates move to the dataset's latents (ours)."""
+    return cfg.anchor == "snap" or (cfg.anchor == "auto" and fns.snaps)
+
+
 def anchored(fns: SearchFns, z: Tensor, cfg: PlannerConfig) -> tuple[Tensor, Tensor]:
     """Candidates [B, K, D] after anchoring to the dataset's latents, and which of them [B, K] bool are supported (ours)."""
-    if cfg.anchor == "none" or (cfg.anchor == "auto" and not fns.snaps):
+    if not snaps(fns, cfg):
         return z, torch.ones(z.shape[:-1], dtype=torch.bool, device=z.device)
     if fns.project is None:
         raise ConfigError(f"config field `anchor` is {cfg.anchor!r}, but the model keeps no dataset latents; "

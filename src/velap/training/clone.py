@@ -21,7 +21,7 @@ from velap.models.horizon import q_from_steps
 from velap.models.velap import LatentModel
 from velap.threads import TRANSITIONS_A_THREAD, one_thread
 from velap.training.capture import adam
-from velap.training.encoding import evaluated
+from velap.training.encoding import encode_rows, evaluated
 from velap.training.phase import FROZEN_RATE, Frozen, PhaseLearner, Run
 from velap.training.steps import cosine
 
@@ -56,6 +56,18 @@ def arrival_rate(model: LatentModel, policy: nn.Module, states: Tensor) -> float
     goal_value = q_from_steps(GOAL_EXPONENT, model.discount)
     found = arrivals(policy, model.step, model.value, far, goal_value, HORIZON)
     return float((~found.steps.isinf()).float().mean())
+
+
+@torch.no_grad()
+def measure_arrivals(model: LatentModel, sampler: WindowSampler, generator: torch.Generator) -> None:
+    """Sets `arrival_rates` of a model with a clone, on a CPU generator's choice of states of the data."""
+    policy, pool = model.success_policy, sampler.transitions
+    assert policy is not None, "there is a clone to measure"
+    rows = pool[torch.randint(len(pool), (STATES,), generator=generator).to(pool.device)]
+    with evaluated(model):
+        states = encode_rows(model, sampler, rows)
+        rates = [arrival_rate(model, each, states) for each in (model.global_policy, policy)]
+    model.arrival_rates.copy_(torch.tensor(rates))
 
 
 class Best(nn.Module):

@@ -34,7 +34,7 @@ from velap.models.checkpoint import MODEL as MODEL
 from velap.models.checkpoint import make_model, save_checkpoint
 from velap.models.velap import Spaces
 from velap.runs import make_generator, only_writer, write_atomic
-from velap.training.clone import CloneLearner
+from velap.training.clone import CloneLearner, measure_arrivals
 from velap.training.diagnostics import diagnose, measure_gap, measure_latents
 from velap.training.encoder import EncoderLearner
 from velap.training.ensemble import EnsembleLearner
@@ -76,6 +76,11 @@ def holdout_episodes(store: FrameStore, count: int, seed: int, *, rewarded: bool
     pool = [e for e in range(len(starts)) if bool(store.rewards[starts[e] : starts[e] + lengths[e]].any()) == rewarded]
     n = min(count, (len(pool) if rewarded else len(starts)) // 10, len(pool))
     return np.random.default_rng([seed, 7]).permutation(np.array(pool, dtype=np.int64))[:n]
+
+
+def success_share(store: FrameStore) -> float:
+    """Share of a store's episodes that hold a reward."""
+    return float((np.bincount(store.episode_of, weights=store.rewards) > 0).mean())
 
 
 class Trainer:
@@ -227,6 +232,9 @@ class Trainer:
         diagnostics = self.report()
         self.model.eval()
         measure_latents(self.model, self.sampler, make_generator(self.seed, stream=2))
+        self.model.success_share.fill_(success_share(self.store))
+        if self.model.success_policy is not None:
+            measure_arrivals(self.model, self.sampler, make_generator(self.seed, stream=3))
         measure_gap(self.model, self.sampler, self._held_out(), None if self.frozen is None else self.frozen.latents)
         provenance = {
             "command": command,
