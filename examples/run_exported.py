@@ -32,14 +32,18 @@ class ExportedPolicy:
         self._commands = torch.zeros(1, len(self._low))
 
     @torch.no_grad()
-    def act(self, frame: np.ndarray) -> np.ndarray:
-        """The camera's newest frame uint8 [H, W, 3] -> action float32 [A] in the robot's own range."""
+    def act(self, frame: np.ndarray, state: np.ndarray | None = None) -> np.ndarray:
+        """The camera's newest frame uint8 [H, W, 3], and the state [S] of a model that has one -> action float32 [A] in the
+        robot's own range."""
         if frame.dtype != np.uint8 or list(frame.shape) != self.about["image_shape"]:
             raise ValueError(f"got {frame.dtype}{list(frame.shape)}; expected uint8{self.about['image_shape']}")
         self._frames.append(frame)
         while len(self._frames) < self.about["frame_stack"]:
             self._frames.appendleft(frame)  # the first frame stands for those before it
-        action = self._policy(self._encode(torch.from_numpy(np.stack(self._frames))[None], self._commands))
+        seen = [torch.from_numpy(np.stack(self._frames))[None], self._commands]
+        if self.about["state_size"]:
+            seen.append(torch.tensor(np.asarray(state, np.float32)).reshape(1, self.about["state_size"]))
+        action = self._policy(self._encode(*seen))
         memory = self.about["command_memory"]
         self._commands = memory * self._commands + (1 - memory) * action
         return self._low + (action[0].numpy() + 1) / 2 * (self._high - self._low)

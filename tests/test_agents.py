@@ -117,7 +117,7 @@ def test_lookahead_leaves_a_wall_that_the_local_policy_pushes_into(anchor: str, 
     env.reset(seed=0)
     env.set_agent_position(np.array([-0.5, 3.0]))
     # no rounding to pixels beside the wall
-    model.encode = lambda frames, commands=None: torch.from_numpy(env.agent_position())[None]
+    model.encode = lambda frames, commands=None, state=None: torch.from_numpy(env.agent_position())[None]
     agent.act(frames_at((-0.5, 3.0)))
     with torch.inference_mode():
         set_plan(agent, [(-0.5, 3.0), (3.0, 9.0)])

@@ -73,7 +73,8 @@ def test_every_method_sees_its_own_past_actions(method):
     seen: list[torch.Tensor] = []
     encode = model.encode
 
-    def watched(frames: torch.Tensor, commands: torch.Tensor | None = None) -> torch.Tensor:
+    def watched(frames: torch.Tensor, commands: torch.Tensor | None = None,
+                state: torch.Tensor | None = None) -> torch.Tensor:
         assert commands is not None
         seen.append(commands.clone())
         return encode(frames, commands)

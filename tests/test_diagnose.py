@@ -65,7 +65,7 @@ class LineModel(nn.Module):
         self.period = period
         """States so far apart look the same to Q^l."""
 
-    def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
+    def encode(self, frames: Tensor, commands: Tensor | None = None, state: Tensor | None = None) -> Tensor:
         return frames[..., -1, 0, 0, :1].float()
 
     def step(self, latent: Tensor, action: Tensor) -> Tensor:
@@ -227,7 +227,7 @@ class SeeingModel(nn.Module):
         super().__init__()
         self.anchor, self.world = nn.Parameter(torch.zeros(1)), world
 
-    def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
+    def encode(self, frames: Tensor, commands: Tensor | None = None, state: Tensor | None = None) -> Tensor:
         picture = frames[:, -1].float()
         blue = ((picture[..., 2] - picture[..., 0]) > 60).float()
         axis = torch.arange(64.0) + 0.5

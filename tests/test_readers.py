@@ -115,7 +115,7 @@ def write_robomimic(episodes: list[Episode], path: Path, next_obs: bool = True) 
 
 
 def write_lerobot(episodes: list[Episode], root: Path, codec: str | None = None, episodes_a_file: int = 3,
-                  cameras: tuple[str, ...] = ("observation.images.front",)) -> str:
+                  cameras: tuple[str, ...] = ("observation.images.front",), state: list[np.ndarray] | None = None) -> str:
     """Format v3, as lerobot.datasets writes it; images as PNG columns, or as videos of that codec."""
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     (root / "meta/episodes/chunk-000").mkdir(parents=True)
@@ -127,6 +127,8 @@ def write_lerobot(episodes: list[Episode], root: Path, codec: str | None = None,
     features |= {"action": {"dtype": "float32", "shape": [2], "names": None},
                  "next.reward": {"dtype": "float32", "shape": [1], "names": None},
                  "next.success": {"dtype": "bool", "shape": [1], "names": None}}
+    if state is not None:
+        features["observation.state"] = {"dtype": "float32", "shape": [state[0].shape[1]], "names": None}
     features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in ("episode_index", "frame_index", "index")}
     (root / "meta/info.json").write_text(json.dumps({
         "codebase_version": "v3.0", "robot_type": "so101", "fps": FPS, "total_episodes": len(episodes),
@@ -144,6 +146,8 @@ def write_lerobot(episodes: list[Episode], root: Path, codec: str | None = None,
             columns["action"] += padded(episode.actions).tolist()
             columns["next.reward"] += rewards.tolist()
             columns["next.success"] += (rewards > 0).tolist()
+            if state is not None:
+                columns["observation.state"] += state[number].tolist()
             columns["episode_index"] += [number] * count
             columns["frame_index"] += range(count)
             columns["index"] += range(count)

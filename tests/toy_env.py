@@ -90,7 +90,7 @@ class ToyModel(nn.Module):
     action_dim, config, memory = 2, ModelConfig(frame_stack=2), 0.0
     spaces = Spaces(SIDE, SIDE, (-ACTION_SCALE,) * 2, (ACTION_SCALE,) * 2)
 
-    def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
+    def encode(self, frames: Tensor, commands: Tensor | None = None, state: Tensor | None = None) -> Tensor:
         self.encoded_batches.append(len(frames))
         return read(frames)
 

@@ -72,7 +72,8 @@ def train(source: str | Path | Config, data: str | Path | FrameStore | None = No
           seed: int = 0, out: Path | str | None = None, method: str = "velap", image_key: str | None = None,
           device: str = "auto", resume: bool = False, changes: Changes | None = None, fit: Fit | None = None,
           image_size: int = 64, success: str | Predicate | None = None, mapped: bool | None = None,
-          command: str = "velap.train", loggers: Sequence[str | Logger] = ("jsonl", "tensorboard"),
+          state_key: str | None = None, command: str = "velap.train",
+          loggers: Sequence[str | Logger] = ("jsonl", "tensorboard"),
           on_progress: Callable[[Progress], None] = lambda progress: None) -> Path:
     """Train on a task's dataset, or on any dataset of images and continuous actions; returns the joint checkpoint.
 
@@ -94,6 +95,7 @@ def train(source: str | Path | Config, data: str | Path | FrameStore | None = No
         device: `auto`, `cpu` or `cuda`.
         resume: go on with the joint run in `out`; a finished one is left as it is. Heads always go on.
         changes: config fields to replace; under `head` those of the method's learner.
+        state_key: key of numbers beside the image, such as joint angles; `a,b` of several. They stand behind φ's output.
         command: kept in the checkpoint as its origin.
         loggers: names (`jsonl`, `tensorboard`, `wandb`) or objects with `log` and `close`.
         on_progress: called after every logged step.
@@ -112,10 +114,11 @@ def train(source: str | Path | Config, data: str | Path | FrameStore | None = No
     kind = get_method(method)
     learner = kind.learner_config(config.preset, of_head) if kind.learns or of_head else None
     if isinstance(data, FrameStore):
-        _refuse_with_frames(image_key=image_key, fit=fit, success=success, mapped=mapped)
+        _refuse_with_frames(image_key=image_key, fit=fit, success=success, mapped=mapped, state_key=state_key)
         store = data
     else:
-        store = load_store(data, image_key, DYNAMICS_HORIZON, image_size, fit=fit, success=success, mapped=mapped)
+        store = load_store(data, image_key, DYNAMICS_HORIZON, image_size, fit=fit, success=success, mapped=mapped,
+                           state_key=state_key)
     directory = Path(out) if out is not None else run_dir(config.task, config.preset, seed)
     checkpoint = directory / MODEL
     if not kind.whole_checkpoint and checkpoint.exists():
@@ -217,7 +220,8 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
              first_seed: int = 0, env: str | MakeEnv | None = None, env_kwargs: Mapping[str, Any] | None = None,
              image_key: str | None = None, max_steps: int | None = None, success: str | Predicate | None = None,
              records: Path | str = OWN_RECORDS, fresh: bool = False, batch: int = 10, device: str = "auto",
-             head: Path | str | None = None, changes: Changes | None = None) -> Summary:
+             head: Path | str | None = None, changes: Changes | None = None, state_key: str | None = None,
+             image_size: int = 64) -> Summary:
     """Success rate and more over seeded test episodes; goes on where an earlier call with the same records stopped.
 
     Args:
@@ -240,6 +244,8 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
         device: `auto`, `cpu` or `cuda`.
         head: what the method learnt; None looks for `<method>.safetensors` beside the checkpoint where it needs one.
         changes: fields of the checkpoint's config or of the method's own settings to replace, as in `load`.
+        state_key: with an agent, key of the numbers beside the image that it takes; a checkpoint keeps its own.
+        image_size: with an agent, side of the images that it takes [px].
     """
     from velap.data.building import rule_of
     from velap.evaluation.evaluate import Evaluation, play
@@ -250,11 +256,14 @@ def evaluate(task: str | Agent, checkpoint: Path | str | None = None, *, method:
     rule = str(rule_of(success)) if callable(success) else success
     if not isinstance(task, str):
         return summarise(play(task, env, seeds, env_kwargs=env_kwargs, image_key=image_key, max_steps=max_steps,
-                              success=rule, batch=batch))
+                              success=rule, batch=batch, state_key=state_key, image_size=image_size))
     if not (env is None or isinstance(env, str)):
         raise ConfigError(f"got the environment {env!r} and records to write; expected a Gymnasium id, which records name. "
                           "Register it with gymnasium.register, or evaluate an agent: "
                           "velap.evaluate(velap.load(checkpoint), env=make_env).")
+    if state_key is not None:
+        raise ConfigError(f"got the state {state_key!r} and a checkpoint; expected no state: the checkpoint keeps its own. "
+                          "Leave state_key out.")
     what = Evaluation(task, method=method, checkpoint=None if checkpoint is None else Path(checkpoint), env=env,
                       env_kwargs=dict(env_kwargs or {}), image_key=image_key, max_steps=max_steps,
                       success=rule, device=device, head=None if head is None else Path(head), changes=changes)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from velap.cli.options import ImageKey, joined, note, say
+from velap.cli.options import ImageKey, StateKey, joined, note, say
 from velap.errors import ConfigError
 
 Dataset = Annotated[Positional[str], arg(help="Path of a dataset, or its Minari or LeRobot id.")]
@@ -16,7 +16,7 @@ Fit = Literal["crop", "pad", "squash"]
 
 
 def inspect(dataset: Dataset, image_key: ImageKey = (), success: str | None = None, fit: Fit | None = None,
-            image_size: int = 64, mapped: bool = False, out: Path | None = None) -> None:
+            image_size: int = 64, mapped: bool = False, state_key: StateKey = (), out: Path | None = None) -> None:
     """Say what is in a dataset and what will not work with it; writes a page, its figures as JSON, and pictures.
 
     Args:
@@ -30,7 +30,7 @@ def inspect(dataset: Dataset, image_key: ImageKey = (), success: str | None = No
     from velap.report.inspect import inspection_text, save_inspection
 
     found = run(dataset, image_key=joined(image_key), image_size=image_size, fit=fit, success=success,
-                mapped=mapped or None)
+                mapped=mapped or None, state_key=joined(state_key))
     folder = out or Path("runs/inspection") / Path(dataset).name
     say(inspection_text(found))
     for path in save_inspection(found, folder):

@@ -25,12 +25,15 @@ Settings = Annotated[tuple[tuple[str, ...], ...], UseAppendAction,
 ImageKey = Annotated[tuple[str, ...], UseAppendAction,
                      arg(metavar="KEY", help="Key of the image in dict observations, `a/b` when nested. Give it once "
                                              "for each camera: several stand side by side in one frame.")]
+StateKey = Annotated[tuple[str, ...], UseAppendAction,
+                     arg(metavar="KEY", help="Key of numbers beside the image, such as joint angles, that the latent "
+                                             "holds too. Give it once for each.")]
 Records = Annotated[Path, arg(help="Root of the episode records.")]
 
 
-def joined(image_key: tuple[str, ...]) -> str | None:
-    """The keys of `--image-key` as the Python interface takes them: `a,b`."""
-    return ",".join(image_key) or None
+def joined(keys: tuple[str, ...]) -> str | None:
+    """The keys of `--image-key` or `--state-key` as the Python interface takes them: `a,b`."""
+    return ",".join(keys) or None
 
 
 def command() -> str:

@@ -8,7 +8,21 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from velap.cli.options import OUT, Device, ImageKey, Method, Preset, Records, Settings, Task, command, joined, note, say
+from velap.cli.options import (
+    OUT,
+    Device,
+    ImageKey,
+    Method,
+    Preset,
+    Records,
+    Settings,
+    StateKey,
+    Task,
+    command,
+    joined,
+    note,
+    say,
+)
 from velap.cli.settings import parse_settings
 from velap.errors import ConfigError
 from velap.storage import OWN_RECORDS
@@ -41,6 +55,7 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
           preset: Preset = "default", seed: int = 0, out: Path | None = None, device: Device = "auto", resume: bool = False,
           settings: Settings = (), method: Method = "velap", success: str | None = None,
           fit: Literal["crop", "pad", "squash"] | None = None, image_size: int = 64, mapped: bool = False,
+          state_key: StateKey = (),
           loggers: tuple[Literal["jsonl", "tensorboard", "wandb"], ...] = ("jsonl", "tensorboard")) -> None:
     """Train on a task's dataset or on any dataset of images and continuous actions.
 
@@ -69,7 +84,8 @@ def train(task: Positional[str | None] = None, dataset: str | None = None, image
         get_task(task)
     train_with_progress(str(task or dataset), preset=preset, seed=seed, out=out, image_key=joined(image_key), device=device,
                         resume=resume, settings=settings, method=method, loggers=loggers,
-                        reading={"success": success, "fit": fit, "image_size": image_size, "mapped": mapped or None})
+                        reading={"success": success, "fit": fit, "image_size": image_size, "mapped": mapped or None,
+                                 "state_key": joined(state_key)})
 
 
 def train_with_progress(source: str, *, preset: str, seed: int, out: Path | None, device: str, resume: bool,

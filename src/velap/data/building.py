@@ -97,17 +97,19 @@ def build_store(name: str, episodes: Iterable[Sequence[Episode]], layouts: Seque
         if rule is not None:
             rule.check_labels(len(parts.lengths))
         told, won = parts.successes(rule, name) if need_success else parts.any_successes(rule, name)
-        rows = parts.rows()
+        rows, states = parts.rows(), parts.states(name)
         kept = frames.finish()
     finally:
         frames.close()
-    length = _end_at_success(kept, rows, won, np.asarray(parts.lengths, np.int64), name)
+    seen = [kept] if states is None else [kept, states]
+    length = _end_at_success(seen, rows, won, np.asarray(parts.lengths, np.int64), name)
     count = int((length + 1).sum())
     small = {key: array[:count] for key, array in rows.items()}
     checks.check_ends(small["terminated"], small["truncated"], length, name)
     low, high = checks.bounded_actions(small["actions"], length, *bounds, name)
     return FrameStore.from_arrays(frames=kept[:count], **small, episode_length=length, action_low=low, action_high=high,
-                                  dataset_id=name, reading=replace(reading, image_size=side, success=told))
+                                  dataset_id=name, reading=replace(reading, image_size=side, success=told),
+                                  states=None if states is None else states[:count])
 
 
 class _Parts:
@@ -158,6 +160,14 @@ class _Parts:
         except DatasetError:
             return "" if rule is None else str(rule), [np.zeros(length, bool) for length in self.lengths]
 
+    def states(self, name: str) -> np.ndarray | None:
+        """float32 [F, S] of all episodes; None where they have none. Raises DatasetError where some differ."""
+        widths = {None if episode.state is None else episode.state.shape[1] for episode in self._episodes}
+        if len(widths) > 1:
+            raise DatasetError(f"the states of {name} have {', '.join(map(str, widths))} entries; expected the same number "
+                               "in every episode. Write the others again, or leave the state out.")
+        return None if widths == {None} else np.concatenate([episode.state for episode in self._episodes])
+
     def rows(self) -> dict[str, np.ndarray]:
         """Actions, rewards and flags by frame [F, *], zero in the row of each last frame."""
         def padded(arrays: Iterator[np.ndarray]) -> np.ndarray:
@@ -167,11 +177,12 @@ class _Parts:
                 for name in ("actions", "rewards", "terminated", "truncated")}
 
 
-def _end_at_success(frames: np.ndarray, rows: dict[str, np.ndarray], won: list[np.ndarray], length: np.ndarray,
+def _end_at_success(seen: Sequence[np.ndarray], rows: dict[str, np.ndarray], won: list[np.ndarray], length: np.ndarray,
                     name: str) -> np.ndarray:
-    """Rewards 0 and 1; each episode ends at its first success, rows are moved down in place. Gives the lengths int64 [E]."""
+    """Rewards 0 and 1; each episode ends at its first success, rows of what was `seen` (frames, states) and of what was done
+    are moved down in place. Gives the lengths int64 [E]."""
     lengths, source, target = length.copy(), 0, 0
-    arrays = (frames, *rows.values())
+    arrays = (*seen, *rows.values())
     for episode, steps in enumerate(length):
         hits = np.flatnonzero(won[episode])
         kept = int(hits[0]) + 1 if len(hits) else int(steps)

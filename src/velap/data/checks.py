@@ -90,7 +90,14 @@ def checked_episode(episode: Episode, layout: ImageLayout, action_shape: tuple[i
         truncated = _vector(episode.truncated, "truncations", where, steps).astype(bool)
     elif terminated[-1]:
         truncated[-1] = False
-    return Episode(images, actions.astype(np.float32), rewards, terminated, truncated, episode.infos)
+    state = None if episode.state is None else np.asarray(episode.state)
+    if state is not None:
+        if state.ndim != 2 or len(state) != steps + 1 or state.dtype.kind not in "fiub":
+            raise DatasetError(f"{where}: the state is {state.dtype} of shape {state.shape}; expected numbers of shape "
+                               f"[{steps + 1}, S], one row an image. Write that episode again.")
+        _require_finite(state, "state", where)
+        state = state.astype(np.float32)
+    return Episode(images, actions.astype(np.float32), rewards, terminated, truncated, episode.infos, state)
 
 
 def level_rule(rewards: np.ndarray, dataset_id: str, infos: list[str]) -> float:

@@ -53,12 +53,17 @@ class Reading:
     """Side that images are resized to, of each camera [px]; None keeps that of square ones."""
     fit: Fit | None = None
     """How oblong images become square; None where they are."""
+    state_key: str = ""
+    """Keys of the state beside the image, `a,b`; empty without a state."""
     success: str = ""
     """Rule of `velap.data.success`; empty where rewards are 0 and 1, and 1 is success."""
 
     def to_json(self) -> str:
         """As kept in checkpoints and beside mapped frames."""
-        return json.dumps(asdict(self), sort_keys=True)
+        plain = asdict(self)
+        if not self.state_key:  # as before there were states: the text names mapped frames
+            del plain["state_key"]
+        return json.dumps(plain, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Reading:
@@ -82,10 +87,14 @@ class Episode:
     """bool [T], the recording ended there; None for the last transition where the task did not end."""
     infos: Mapping[str, Any] = field(default_factory=dict)
     """Arrays of T entries, or of T + 1, of which the first one is the reset's."""
+    state: Any = None
+    """float [T + 1, S], numbers beside the images, such as joint angles; None for none."""
 
     @classmethod
-    def of_rows(cls, images: np.ndarray, actions: np.ndarray, rewards: Any, infos: Mapping[str, np.ndarray]) -> Episode:
-        """An episode of formats that store T images and T actions, each beside the image before it, with what it led to.
+    def of_rows(cls, images: np.ndarray, actions: np.ndarray, rewards: Any, infos: Mapping[str, np.ndarray],
+                state: np.ndarray | None = None) -> Episode:
+        """An episode of formats that store T images (and T states) and T actions, each beside the image before it, with what
+        it led to.
 
         The last action leads to no recorded image and is left out. What its row says of the end (a reward, a success) counts
         for the action before, which leads to the last image.
@@ -100,7 +109,7 @@ class Episode:
             return kept
 
         return cls(images, actions[:-1], None if rewards is None else moved(rewards),
-                   infos={name: moved(values) for name, values in infos.items()})
+                   infos={name: moved(values) for name, values in infos.items()}, state=state)
 
 
 @dataclass(frozen=True)
@@ -130,23 +139,27 @@ class FrameStore:
     """SHA-256 of the arrays above, hexadecimal."""
     reading: Reading = Reading()
     """How they were read."""
+    states: np.ndarray | None = None
+    """float32 [F, S], numbers beside the frames; None without."""
 
     @classmethod
     def from_arrays(cls, *, frames: np.ndarray, actions: np.ndarray, rewards: np.ndarray, terminated: np.ndarray,
                     truncated: np.ndarray, episode_length: Any, action_low: Any, action_high: Any,
-                    dataset_id: str = "arrays", reading: Reading | None = None) -> FrameStore:
+                    dataset_id: str = "arrays", reading: Reading | None = None,
+                    states: np.ndarray | None = None) -> FrameStore:
         """A store of rows as above; starts and content hash are computed, frames are not copied."""
         length = np.asarray(episode_length, dtype=np.int64)
         rows = int((length + 1).sum())
         counts = [len(array) for array in (frames, actions, rewards, terminated, truncated)]
-        if counts != [rows] * 5:
+        if counts != [rows] * 5 or (states is not None and len(states) != rows):
             raise DatasetError(f"frames, actions, rewards, terminated and truncated have {counts} rows; expected "
                                f"{rows} each, one more than transitions in every episode. Pad the last row of each "
                                "episode with zeros.")
         store = cls(frames, actions.astype(np.float32, copy=False), rewards.astype(np.float32, copy=False),
                     terminated.astype(bool, copy=False), truncated.astype(bool, copy=False),
                     np.cumsum(length + 1) - length - 1, length, np.asarray(action_low, np.float32),
-                    np.asarray(action_high, np.float32), dataset_id, "", reading or Reading(image_size=frames.shape[1]))
+                    np.asarray(action_high, np.float32), dataset_id, "", reading or Reading(image_size=frames.shape[1]),
+                    None if states is None else states.astype(np.float32, copy=False))
         return replace(store, content_hash=content_hash(store))
 
     @classmethod

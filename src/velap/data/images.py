@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -62,12 +62,16 @@ class ImageLayout:
         return np.asarray(observation)
 
 
-def _leaves(space: gym.Space, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], gym.Space]]:
-    if isinstance(space, gym.spaces.Dict):
-        for key, inner in space.spaces.items():
-            yield from _leaves(inner, (*path, key))
-    else:
-        yield path, space
+def leaves_of(space: gym.Space, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], gym.Space]:
+    """The spaces within nested Dicts by their path of keys; a plain one under the empty path."""
+    if not isinstance(space, gym.spaces.Dict):
+        return {path: space}
+    return {found: leaf for key, inner in space.spaces.items() for found, leaf in leaves_of(inner, (*path, key)).items()}
+
+
+def image_like(space: gym.Space) -> bool:
+    """Is that a Box with the sides of an image?"""
+    return _layout((), space) is not None
 
 
 def _layout(path: tuple[str, ...], space: gym.Space) -> ImageLayout | None:
@@ -81,7 +85,8 @@ def _layout(path: tuple[str, ...], space: gym.Space) -> ImageLayout | None:
     return layout if min(ImageLayout(path, image, channel_first).sides) >= MIN_SIDE else None
 
 
-def _listing(leaves: dict[tuple[str, ...], gym.Space]) -> str:
+def listing(leaves: Mapping[tuple[str, ...], gym.Space]) -> str:
+    """Observations by key, type and shape."""
     def brief(space: gym.Space) -> str:
         return f"{space.dtype}{list(space.shape)}" if isinstance(space, gym.spaces.Box) else type(space).__name__
 
@@ -119,20 +124,20 @@ def find_image(space: gym.Space, image_key: str, where: str,
         advice: what to do where there is no image.
         fit: how an oblong image becomes square; without it such an image is refused.
     """
-    leaves = dict(_leaves(space))
+    leaves = leaves_of(space)
     if image_key and () in leaves:
         raise DatasetError(f"{where} has plain observations and no key {image_key!r}; expected none. Leave --image-key out.")
     if image_key:
         path = next((path for path in leaves if "/".join(path) == image_key), None)
         if path is None:
-            raise DatasetError(f"{where} has no observation key {image_key!r}; expected one of {_listing(leaves)}. "
+            raise DatasetError(f"{where} has no observation key {image_key!r}; expected one of {listing(leaves)}. "
                                "Name the image with --image-key.")
         leaves = {path: leaves[path]}
     found = [layout for path, leaf in leaves.items() if (layout := _layout(path, leaf)) is not None]
     if len(found) > 1:
         found = [layout for layout in found if _is_picture(layout, leaves[layout.key])] or found
     if not found:
-        raise DatasetError(f"{where} has no image among its observations ({_listing(leaves)}); expected images "
+        raise DatasetError(f"{where} has no image among its observations ({listing(leaves)}); expected images "
                            f"[H, W, 3]. velap learns from pixels: {advice}.")
     if len(found) > 1:
         cameras = ", ".join(layout.name for layout in found)
@@ -143,7 +148,7 @@ def find_image(space: gym.Space, image_key: str, where: str,
 
 def known_key(space: gym.Space, image_key: str) -> str | None:
     """The key, or keys `a,b`, if observations of that space have them."""
-    names = {"/".join(path) for path, _ in _leaves(space)}
+    names = {"/".join(path) for path in leaves_of(space)}
     return image_key if image_key and names.issuperset(keys_of(image_key)) else None
 
 

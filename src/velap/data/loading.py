@@ -17,6 +17,7 @@ from velap.data.building import build_store, rule_of
 from velap.data.frames import Episode, FrameStore, Reading
 from velap.data.images import IMAGE_SIZE, Fit, ImageLayout, find_images
 from velap.data.mapped import open_or_build, too_large
+from velap.data.state import StateLayout, find_state
 from velap.data.success import Predicate, Success
 from velap.errors import DatasetError
 from velap.registry import READERS
@@ -48,8 +49,8 @@ class Reader(Protocol):
     def state(self) -> str:
         """What changes whenever the dataset does, such as a checksum, or sizes and times of its files."""
 
-    def episodes(self, layout: ImageLayout) -> Iterator[Episode]:
-        """All episodes in order, with the images of that camera as stored."""
+    def episodes(self, layout: ImageLayout, state: StateLayout | None = None) -> Iterator[Episode]:
+        """All episodes in order, with the images of that camera as stored, and that state where one is asked for."""
 
 
 def find_reader(source: str) -> Reader:
@@ -72,7 +73,7 @@ def files_state(paths: list[Path]) -> str:
 
 def load_store(source: str | Path, image_key: str | None = None, min_length: int = 1, image_size: int | None = IMAGE_SIZE, *,
                fit: Fit | None = None, success: str | Success | Predicate | None = None,
-               mapped: bool | None = None, need_success: bool = True) -> FrameStore:
+               mapped: bool | None = None, need_success: bool = True, state_key: str | None = None) -> FrameStore:
     """Read a dataset of images and continuous actions, ours or a stranger's, of any format that has a reader.
 
     Rewards become 0 and 1. An episode ends at its first success: what was recorded beyond is left out. Grey images are
@@ -90,6 +91,7 @@ def load_store(source: str | Path, image_key: str | None = None, min_length: int
         mapped: map the frames from a file beside the dataset, which is made at the first call; None does so where they would
             take more than their share of memory.
         need_success: whether a dataset without any success is refused, as training must.
+        state_key: key of numbers beside the image, `a,b` of several; None reads none.
 
     Raises:
         DatasetError: the dataset is missing, damaged or not of this kind; the text says the way out.
@@ -97,17 +99,20 @@ def load_store(source: str | Path, image_key: str | None = None, min_length: int
     """
     reader = find_reader(str(source))
     layouts = find_images(reader.observation_space, image_key, reader.name, fit=fit)
+    state = find_state(reader.observation_space, state_key, reader.name)
     bounds = checks.action_bounds(reader.action_space, reader.name)
     rule = rule_of(success)
-    reading = Reading(",".join(layout.name for layout in layouts), image_size, fit)
+    reading = Reading(",".join(layout.name for layout in layouts), image_size, fit,
+                      "" if state is None else ",".join(state.names))
     side = image_size or max(side for layout in layouts for side in layout.sides)
 
     def build(path: Path | None) -> FrameStore:
-        views = zip(*(reader.episodes(layout) for layout in layouts), strict=True)
+        views = zip(*(reader.episodes(layout) if state is None else reader.episodes(layout, state) for layout in layouts),
+                    strict=True)
         store = build_store(reader.name, views, layouts, bounds, reading, rule, reader.frames, path,
                             need_success)
         stored = [layout.sides for layout in layouts]
-        if reader.content_sha256 is not None and stored == [(side, side)] and rule is None \
+        if reader.content_sha256 is not None and stored == [(side, side)] and rule is None and state is None \
                 and store.content_hash != reader.content_sha256:
             raise minari_io.damaged(reader.name, f"its arrays have SHA-256 {store.content_hash[:12]}…, not "
                                                  f"{reader.content_sha256[:12]}…")

@@ -91,6 +91,8 @@ class WindowSampler:
         self.actions = put(((store.actions - low) / (high - low) * 2 - 1).clip(-1, 1).astype(np.float32))
         self.rewards = put(store.rewards)
         self.terminated = put(store.terminated)
+        self.states = None if store.states is None else put(store.states)
+        """float32 [F, S], as recorded; None without."""
         self.first = put(store.first)
         self.last = put(store.last)
         training = ~np.isin(store.episode_of, holdout)

@@ -90,7 +90,8 @@ class Player:
 
     def frames_of(self, env: gym.Env[Any, Any]) -> FrameReader:
         """The reader of an environment's frames, which squares and resizes them as the training data were."""
-        return FrameReader(env, self.image_size, self.key.image_key, self.reading.fit)
+        size = 0 if self.model is None else self.model.spaces.state_dim
+        return FrameReader(env, self.image_size, self.key.image_key, self.reading.fit, self.reading.state_key, size)
 
     @property
     def device(self) -> str:
@@ -132,7 +133,8 @@ def load_player(what: Evaluation) -> Player:
     try:
         agent = make_agent(what.method, model, config, _checked_actions(env, model), loaded.head, loaded.settings)
         image_key = what.image_key or known_key(env.observation_space, loaded.reading.image_key)
-        read = FrameReader(env, size, image_key, loaded.reading.fit)
+        read = FrameReader(env, size, image_key, loaded.reading.fit, loaded.reading.state_key,
+                           0 if model is None else model.spaces.state_dim)
         if model is not None and read.size != (size, model.spaces.width):
             got, learnt = image_key or "its only camera", loaded.reading.image_key or "one camera"
             raise ConfigError(f"{env_id} gives frames of {read.size[0]} × {read.size[1]} px ({got}); expected {size} × "
@@ -286,7 +288,7 @@ def evaluate(what: Evaluation, seeds: range, records: Path, *, batch: int = BATC
 
 def play(agent: Agent, env: str | MakeEnv | None, seeds: range, *, env_kwargs: Mapping[str, Any] | None = None,
          image_key: str | None = None, max_steps: int | None = None, success: str | None = None,
-         image_size: int = IMAGE_SIZE, batch: int = BATCH) -> list[Record]:
+         image_size: int = IMAGE_SIZE, batch: int = BATCH, state_key: str | None = None) -> list[Record]:
     """Run an agent's episodes and return their records, one a seed, without writing them.
 
     Args:
@@ -299,6 +301,7 @@ def play(agent: Agent, env: str | MakeEnv | None, seeds: range, *, env_kwargs: M
         success: what counts as success, a rule of `velap.data.success`; None: the info's `success`, else a positive reward.
         image_size: side of the images that the agent takes [px].
         batch: environments at once.
+        state_key: key of numbers beside the image, for an agent that takes them.
     """
     if env is None:
         raise ConfigError("got an agent and no environment; expected a task name or a Gymnasium id, such as "
@@ -316,7 +319,7 @@ def play(agent: Agent, env: str | MakeEnv | None, seeds: range, *, env_kwargs: M
                  code_version=code_version(), image_key=image_key, max_steps=limit,
                  success_rule=success)
     player = Player(agent=agent, model=None, config=Config(task=name, preset="none"), key=key, image_size=image_size,
-                    make_env=lambda: make_env(env_id, env_kwargs))
+                    make_env=lambda: make_env(env_id, env_kwargs), reading=Reading(state_key=state_key or ""))
     return [to_record(key, each, min(batch, len(seeds)), device="")
             for each in sorted(player.episodes(seeds, batch), key=lambda each: each.seed)]
 

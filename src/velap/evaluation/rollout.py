@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from velap.data.frames import stack_indices
 from velap.data.images import Fit, find_images, side_by_side
+from velap.data.state import find_state
 from velap.data.success import Success, success_of
 from velap.errors import ConfigError
 from velap.methods.base import Agent, FollowsTree
@@ -64,11 +65,16 @@ class FrameReader:
     """Observations of one environment -> frames uint8 [side, side, 3], by the rules that datasets are read by; several
     cameras stand side by side."""
 
-    def __init__(self, env: gym.Env[Any, Any], side: int, image_key: str | None = None, fit: Fit | None = None) -> None:
-        """`fit` is how the dataset's oblong images became square."""
+    def __init__(self, env: gym.Env[Any, Any], side: int, image_key: str | None = None, fit: Fit | None = None,
+                 state_key: str | None = None, state_dim: int = 0) -> None:
+        """Find the cameras, and the state under `state_key`, with `state_dim` entries S where the agent takes one.
+
+        `fit` is how the dataset's oblong images became square.
+        """
         self._name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
         self._layouts = find_images(env.observation_space, image_key, self._name, NO_PIXELS, fit)
         self._side, self._fit = side, fit
+        self._state = find_state(env.observation_space, state_key, self._name, state_dim)
         self.size = (side, side * len(self._layouts))
         """Height and width of the frames [px]."""
 
@@ -82,12 +88,18 @@ class FrameReader:
         return side_by_side([image[None] for image in images], self._layouts, self._side, self._fit)[0]
 
 
+    def state(self, observation: Any) -> NDArray[np.float32] | None:
+        """The state [S] of one observation; None for agents that take none."""
+        return None if self._state is None else self._state.of(observation)
+
+
 @dataclass
 class _Running:
     """One row's episode in progress."""
 
     seed: int
     frames: list[NDArray[np.uint8]]
+    state: NDArray[np.float32] | None
     plan_ms: list[float] = field(default_factory=list)
     plan_steps: int | None = None
 
@@ -125,12 +137,14 @@ class Rollout:
         batch = min(len(self._envs), len(queue))
         rows: list[_Running | None] = [None] * batch
         stacks: list[NDArray[np.uint8]] = [np.empty(0, np.uint8)] * batch
+        states: list[NDArray[np.float32] | None] = [None] * batch
         while queue or any(row is not None for row in rows):
             self._start(rows, queue)
             for index, row in enumerate(rows):
                 if row is not None:
-                    stacks[index] = row.stacked(self._agent.frame_stack)
-            actions = self._agent.act(np.stack(stacks))
+                    stacks[index], states[index] = row.stacked(self._agent.frame_stack), row.state
+            held = [state for state in states if state is not None]  # of all rows or of none
+            actions = self._agent.act(np.stack(stacks), np.stack(held)) if held else self._agent.act(np.stack(stacks))
             by_plan = None if self._tree is None else self._tree.by_plan
             for index, row in enumerate(rows):
                 if row is not None and by_plan is not None:
@@ -149,7 +163,7 @@ class Rollout:
                 seed = queue.popleft()
                 options = {} if self._options is None else {"options": self._options}  # not every environment takes some
                 observation, _ = self._envs[index].reset(seed=seed, **options)
-                rows[index] = _Running(seed, [self._read(observation)])
+                rows[index] = _Running(seed, [self._read(observation)], self._read.state(observation))
                 mask[index], seeds[index] = True, seed
         if mask.any():
             self._agent.reset(mask, seeds)
@@ -163,6 +177,7 @@ class Rollout:
             self._observer(Moment(row=index, seed=row.seed, env=env, agent=self._agent, frame=row.frames[-1]))
         observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
         row.frames.append(self._read(observation))
+        row.state = self._read.state(observation)
         success = success_of(_number(reward), info, self._success, bool(terminated))
         out_of_time = truncated or (self._max_steps is not None and row.steps >= self._max_steps)
         if not (success or terminated or out_of_time):

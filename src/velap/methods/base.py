@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from velap.training.frozen import FrozenLearner, LearnerConfig
 
 
+State = NDArray[np.floating[Any]] | None
+"""[B, S] numbers beside the frames; None for models without."""
+
+
 class Agent(Protocol):
     """Acts in B environments at once; rows never influence each other."""
 
@@ -42,8 +46,9 @@ class Agent(Protocol):
         numbers."""
         ...
 
-    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Stacked frames [B, N, H, W, 3], oldest first -> actions [B, A] in the environment's own range.
+    def act(self, frames: NDArray[np.uint8], state: State = None) -> NDArray[np.float32]:
+        """Stacked frames [B, N, H, W, 3], oldest first, and the newest state [B, S] of a model that has one -> actions
+        [B, A] in the environment's own range.
 
         A batch of another size than the last one starts new episodes in all rows.
         """

@@ -28,7 +28,7 @@ from velap.runs import content_sha256, load_tensors, save_tensors
 class Head(nn.Module, ABC):
     """Base of all heads. `method` and `settings` say what it is: they are kept in its file and enter record hashes.
 
-    A subclass takes the model's config and A, `Head(config, action_dim)`, and finds D in `self.latent_dim`.
+    A subclass takes the model's config, A and S, `Head(config, action_dim, state_dim)`, and finds D in `self.latent_dim`.
     """
 
     method: str = ""
@@ -39,17 +39,17 @@ class Head(nn.Module, ABC):
     """Hash of weights and settings, the same for the same training; set by `save_head` and `load_head`."""
 
     @abstractmethod
-    def __init__(self, config: ModelConfig, action_dim: int) -> None:
+    def __init__(self, config: ModelConfig, action_dim: int, state_dim: int = 0) -> None:
         super().__init__()
-        self.latent_dim = latent_width(config, action_dim)
+        self.latent_dim = latent_width(config, action_dim, state_dim)
         """D, what the joint model's latents hold in all."""
 
 
 class PolicyHead(Head):
     """A policy of Table 5: all that BC learns."""
 
-    def __init__(self, config: ModelConfig, action_dim: int) -> None:
-        super().__init__(config, action_dim)
+    def __init__(self, config: ModelConfig, action_dim: int, state_dim: int = 0) -> None:
+        super().__init__(config, action_dim, state_dim)
         self.policy = Policy(self.latent_dim, POLICY, action_dim, config.norm)
 
     def act(self, latent: Tensor) -> Tensor:
@@ -65,12 +65,12 @@ def head_path(checkpoint: Path | str, method: str) -> Path:
     return find_checkpoint(checkpoint).with_name(f"{method}.safetensors")
 
 
-def make_head(method: str, config: ModelConfig, action_dim: int) -> Head:
+def make_head(method: str, config: ModelConfig, action_dim: int, state_dim: int = 0) -> Head:
     """A fresh head of that method; raises UnknownTaskError for a method without one."""
     kind = get_method(method)
     if kind.head is None:
         raise kind.nothing_to_learn()
-    head = kind.head(config, action_dim)
+    head = kind.head(config, action_dim, *([state_dim] if state_dim else []))
     head.method = method
     return head
 
@@ -113,7 +113,8 @@ def load_head(path: Path | str, joint_metadata: Mapping[str, str], device: torch
                               f"{own[:12]}, the checkpoint has {given[:12]}. Train it again with `velap train --method "
                               f"{method}`, or give the checkpoint that lies beside it.")
     config = Config.from_json(joint_metadata["config"])
-    head = make_head(method, config.model, len(json.loads(joint_metadata["spaces"])["action_low"]))
+    spaces = json.loads(joint_metadata["spaces"])
+    head = make_head(method, config.model, len(spaces["action_low"]), len(spaces.get("state_mean", ())))
     restore(head, tensors, path)
     head.settings, head.weights_sha256 = metadata["head_config"], metadata[WEIGHTS_SHA256]
     return head.to(device).eval().requires_grad_(False)

@@ -75,8 +75,8 @@ N_CRITICS = 2
 class IQLHead(PolicyHead):
     """The policy of Table 5 beside the critics Q and V of Table 6."""
 
-    def __init__(self, config: ModelConfig, action_dim: int) -> None:
-        super().__init__(config, action_dim)
+    def __init__(self, config: ModelConfig, action_dim: int, state_dim: int = 0) -> None:
+        super().__init__(config, action_dim, state_dim)
         self.critics = EnsembleMLP(N_CRITICS, self.latent_dim + action_dim, CRITIC, config.norm)
         self.value_net = MLP(self.latent_dim, CRITIC, 1, config.norm)
 

@@ -86,8 +86,8 @@ class SubgoalHead(Head):
     The value that ranks subgoals is the joint checkpoint's `LatentModel.value`, as in D.4 and D.5.
     """
 
-    def __init__(self, config: ModelConfig, action_dim: int) -> None:
-        super().__init__(config, action_dim)
+    def __init__(self, config: ModelConfig, action_dim: int, state_dim: int = 0) -> None:
+        super().__init__(config, action_dim, state_dim)
         latent, norm = self.latent_dim, config.norm
         self.manager = ConditionalVAE(latent, latent, NOISE_DIM, GENERATIVE, norm, bounded=False)
         self.worker = Policy(2 * latent, POLICY, action_dim, norm)

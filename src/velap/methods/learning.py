@@ -160,7 +160,7 @@ def train_head(method: str, checkpoint: Path | str, store: FrameStore, out: Path
         return finished
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        head = make_head(method, joint.model, model.action_dim).to(place).train()
+        head = make_head(method, joint.model, model.action_dim, model.spaces.state_dim).to(place).train()
     head.settings = config.to_json()
     data = latent_data(model, joint, metadata, store, checkpoint.parent)
     learner = kind.learner(head, data, config, make_generator(seed, stream=3, device=place))

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from velap.methods.base import checked_starts
+from velap.methods.base import State, checked_starts
 from velap.methods.states import StateEncoder
 
 if TYPE_CHECKING:
@@ -54,12 +54,12 @@ class PlanningAgent(ABC):
         self._age[mask] = self._period
 
     @torch.inference_mode()
-    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def act(self, frames: NDArray[np.uint8], state: State = None) -> NDArray[np.float32]:
         """Frames [B, N, H, W, 3] -> actions [B, A]."""
-        frames = self._states.checked(frames)
+        frames = self._states.checked(frames, state)
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
-        latents = self._states(frames)
+        latents = self._states(frames, state)
         self.last_plan_ms[:] = np.nan
         due = np.flatnonzero(self._age >= self._period)
         at_once = 1 if self._device.type == "cpu" else max(len(due), 1)

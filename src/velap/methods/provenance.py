@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from velap.config.planning import has_provenance
+from velap.methods.base import State
 from velap.methods.tree_agent import Actor, TreeAgent
 from velap.models.horizon import steps_from_q
 from velap.search import est, provenance
@@ -80,9 +81,9 @@ class ProvenanceAgent(TreeAgent):
         """[B] log_γ Q^g where the present edge began [steps]."""
 
     @torch.inference_mode()
-    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def act(self, frames: NDArray[np.uint8], state: State = None) -> NDArray[np.float32]:
         """One step: frames [B, N, H, W, 3] -> actions [B, A]."""
-        z = self._observe(frames)
+        z = self._observe(frames, state)
         self._spent += 1
         self._advance(z, steps_from_q(self._values.clamp(min=1e-6), self._fns.discount).float())
         used_up = (self.plans.length > 1) & ~self._on_edge

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velap.errors import ConfigError
-from velap.methods.base import Agent, Method, Parts, checked_starts
+from velap.methods.base import Agent, Method, Parts, State, checked_starts
 from velap.methods.states import checked_frames
 from velap.registry import register_method
 
@@ -44,7 +44,7 @@ class RandomAgent:
         for row, seed in starts:
             self._generators[row] = np.random.default_rng(seed)
 
-    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def act(self, frames: NDArray[np.uint8], state: State = None) -> NDArray[np.float32]:
         """Uniform actions [B, A]; of the frames [B, N, H, W, 3] only the number counts, H and W are any."""
         frames = checked_frames(frames, self.frame_stack)
         if len(frames) != len(self._generators):

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from velap.methods.base import checked_starts
+from velap.methods.base import State, checked_starts
 from velap.methods.states import StateEncoder
 
 if TYPE_CHECKING:
@@ -38,9 +38,9 @@ class ReactiveAgent:
         self.last_plan_ms = np.full(len(mask), np.nan)
 
     @torch.inference_mode()
-    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def act(self, frames: NDArray[np.uint8], state: State = None) -> NDArray[np.float32]:
         """Frames [B, N, H, W, 3] -> actions [B, A]."""
-        frames = self._states.checked(frames)
+        frames = self._states.checked(frames, state)
         if len(frames) != len(self.last_plan_ms):
             self.reset(np.ones(len(frames), bool))
-        return self._states.act(self._policy(self._states(frames)))
+        return self._states.act(self._policy(self._states(frames, state)))

@@ -1,4 +1,4 @@
-"""Frames to latents, with what an agent remembers of its own actions (`command_dims`, ours).
+"""Frames to latents, with what an agent remembers of its own actions (`command_dims`, ours) and the state beside them.
 
 B environments, N stacked frames, A action dimension, D latent.
 """
@@ -78,14 +78,25 @@ class StateEncoder:
         started = torch.from_numpy(mask).to(self._device)
         self._commands = self._commands.masked_fill(started[:, None], 0.0)
 
-    def checked(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """`checked_frames` by the model's own N, H and W; an agent calls it before it changes anything of its own."""
-        spaces = self._model.spaces
-        return checked_frames(frames, self._model.config.frame_stack, (spaces.height, spaces.width))
+    def checked(self, frames: NDArray[np.uint8], state: NDArray[np.floating[Any]] | None = None) -> NDArray[np.uint8]:
+        """`checked_frames` by the model's own N, H and W; raises ObservationError for another state than [B, S] as well. An
+        agent calls it before it changes anything of its own."""
+        spaces, size = self._model.spaces, self._model.spaces.state_dim
+        checked = checked_frames(frames, self._model.config.frame_stack, (spaces.height, spaces.width))
+        got = None if state is None else np.asarray(state)
+        wanted = (len(checked), size) if size else None
+        if (None if got is None else got.shape) != wanted or (got is not None and not np.isfinite(got).all()):
+            raise ObservationError(f"got {'no state' if got is None else f'a state of shape {list(got.shape)}'}; expected "
+                                   f"{f'finite numbers [{len(checked)}, {size}]' if size else 'none'}, as the training data "
+                                   "have. Call act(frames, state).")
+        return checked
 
-    def __call__(self, frames: NDArray[np.uint8]) -> Tensor:
-        """Frames [B, N, H, W, 3] -> latents [B, D]; raises ObservationError on any other frames."""
-        return self._model.encode(torch.from_numpy(self.checked(frames)).to(self._device), self._commands)
+    def __call__(self, frames: NDArray[np.uint8], state: NDArray[np.floating[Any]] | None = None) -> Tensor:
+        """Frames [B, N, H, W, 3], and the state [B, S] of a model that has one -> latents [B, D]; raises ObservationError on
+        anything else."""
+        seen = torch.from_numpy(self.checked(frames, state)).to(self._device)
+        held = None if state is None else torch.from_numpy(np.array(state, np.float32)).to(self._device)
+        return self._model.encode(seen, self._commands, held)
 
     def act(self, actions: Tensor) -> NDArray[np.float32]:
         """Actions [B, A] in [-1, 1] in the environment's own range; they are remembered as taken."""

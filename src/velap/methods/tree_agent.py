@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from velap.methods.base import checked_starts
+from velap.methods.base import State, checked_starts
 from velap.methods.lookahead import local_policy_of
 from velap.methods.states import StateEncoder
 from velap.methods.waypoints import Plans
@@ -105,19 +105,19 @@ class TreeAgent(ABC):
         self._age[started] = self._n_replan
 
     @abstractmethod
-    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def act(self, frames: NDArray[np.uint8], state: State = None) -> NDArray[np.float32]:
         """One step: frames [B, N, H, W, 3] -> actions [B, A]."""
 
     @abstractmethod
     def _search(self, z: Tensor, generators: list[torch.Generator]) -> Path:
         """Plans from latents [P, D]."""
 
-    def _observe(self, frames: NDArray[np.uint8]) -> Tensor:
+    def _observe(self, frames: NDArray[np.uint8], state: State) -> Tensor:
         """The latents [B, D] of frames [B, N, H, W, 3], and where they are near the goal."""
-        frames = self._states.checked(frames)
+        frames = self._states.checked(frames, state)
         if len(frames) != len(self._generators):
             self.reset(np.ones(len(frames), bool))
-        self._latents = self._states(frames)
+        self._latents = self._states(frames, state)
         self._values = self._fns.value(self._latents)
         self._near_goal = self._values > self._stop_value
         return self._latents

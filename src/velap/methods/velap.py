@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from velap.config.planning import has_provenance
-from velap.methods.base import Agent, Learnt, Method, Parts
+from velap.methods.base import Agent, Learnt, Method, Parts, State
 from velap.methods.provenance import ProvenanceAgent
 from velap.methods.tree_agent import Actor, TreeAgent
 from velap.registry import PLANNERS, register_method
@@ -41,9 +41,9 @@ class VelapAgent(TreeAgent):
         self._planner, self._planner_config = planner, config.planner
 
     @torch.inference_mode()
-    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def act(self, frames: NDArray[np.uint8], state: State = None) -> NDArray[np.float32]:
         """One step of Algorithm 2: frames [B, N, H, W, 3] -> actions [B, A]."""
-        z = self._observe(frames)  # Alg. 2, l. 2 and 12; l. 4: "goal not achieved", by B.7's proximity
+        z = self._observe(frames, state)  # Alg. 2, l. 2 and 12; l. 4: "goal not achieved", by B.7's proximity
         self._replan(z, (self._age >= self._n_replan) & ~self._near_goal)  # l. 5-8
         self._age += 1  # l. 13
         self.plans.advance(self._fns, z, self._reached_value)  # l. 9

@@ -26,7 +26,7 @@ WEIGHTS_SHA256 = "weights_sha256"
 """Metadata key: hash of weights and config alone, the same for the same training however long it took."""
 SHARED_SHA256 = "shared_sha256"
 """Metadata key: hash of the weights that heads and other methods share; see `shared_weights`."""
-SHARED = ("encoder.", "command_weight", "action_", "dynamics.", "global_policy.", "global_critic.")
+SHARED = ("encoder.", "command_weight", "state_", "action_", "dynamics.", "global_policy.", "global_critic.")
 """Beginnings of the names of weights that heads and other methods act by: φ, g, h, π^g and Q^g; `action_` is g and the
 bounds."""
 YOUNGER = ("bank_gap", "success_share", "arrival_rates")
@@ -82,7 +82,8 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> tup
         )
     config = Config.from_json(metadata["config"])
     raw = json.loads(metadata["spaces"])
-    spaces = Spaces(raw["height"], raw["width"], tuple(raw["action_low"]), tuple(raw["action_high"]))
+    tuples = {name: tuple(value) for name, value in raw.items() if isinstance(value, list)}
+    spaces = Spaces(**{**raw, **tuples})
     model = make_model(config, spaces)
     restore(model, tensors, path)
     return model.to(device).eval().requires_grad_(False), config, metadata

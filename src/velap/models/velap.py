@@ -33,12 +33,21 @@ COMMAND_SCALE = 2.0
 
 @dataclass(frozen=True)
 class Spaces:
-    """What the data look like: frame size [px] and action bounds."""
+    """What the data look like: frame size [px], action bounds, and the state beside the frames."""
 
     height: int
     width: int
     action_low: tuple[float, ...]
     action_high: tuple[float, ...]
+    state_mean: tuple[float, ...] = ()
+    """[S]; empty where there is no state."""
+    state_scale: tuple[float, ...] = ()
+    """[S] one by the deviation, 0 for entries that never vary."""
+
+    @property
+    def state_dim(self) -> int:
+        """S, entries of the state beside the frames; 0 without one."""
+        return len(self.state_mean)
 
 
 class Origin(NamedTuple):
@@ -62,7 +71,7 @@ class LatentModel(nn.Module):
         self.origin: Origin | None = None
         """Set by `from_pretrained`."""
         action, norm = len(spaces.action_low), config.norm
-        latent = latent_width(config, action)
+        latent = latent_width(config, action, spaces.state_dim)
         self.encoder = encoder_class(config)(config, (spaces.height, spaces.width))
         self.dynamics = MLP(latent + action, DYNAMICS, latent, norm)
         self.action_model = ConditionalVAE(latent, action, NOISE_DIM, GENERATIVE, norm, bounded=True)
@@ -76,6 +85,9 @@ class LatentModel(nn.Module):
                 nn.init.constant_(critic.biases[-1], UNREWARDED)
         if config.command_dims > 0:
             self.register_buffer("command_weight", torch.tensor(COMMAND_SCALE))
+        if spaces.state_dim > 0:
+            self.register_buffer("state_mean", torch.tensor(spaces.state_mean))
+            self.register_buffer("state_scale", torch.tensor(spaces.state_scale))
         self.register_buffer("action_low", torch.tensor(spaces.action_low))
         self.register_buffer("action_high", torch.tensor(spaces.action_high))
         self.register_buffer("step_distance", torch.tensor(0.0))
@@ -87,6 +99,8 @@ class LatentModel(nn.Module):
         self.register_buffer("bank_rows", torch.full((config.bank_size,), -1, dtype=torch.int32))
         self.command_weight: Tensor
         """float32 [], `COMMAND_SCALE`."""
+        self.state_mean: Tensor
+        self.state_scale: Tensor
         self.action_low: Tensor
         self.action_high: Tensor
         self.step_distance: Tensor
@@ -101,21 +115,29 @@ class LatentModel(nn.Module):
         self.bank_latents: Tensor
         self.bank_rows: Tensor
 
-    def encode(self, frames: Tensor, commands: Tensor | None = None) -> Tensor:
-        """φ, and behind it the remembered commands (`command_dims`): uint8 `[*, N, H, W, 3] → [*, D]`.
+    def encode(self, frames: Tensor, commands: Tensor | None = None, state: Tensor | None = None) -> Tensor:
+        """φ, and behind it what is known beside the frames: uint8 `[*, N, H, W, 3] → [*, D]`."""
+        return self.with_known(self.encoder(frames), commands, state)
 
-        commands `[*, A]`: leaky mean of the past actions in [-1, 1], `velap.data.commands`; None stands for zeros, as at the
-        start of an episode.
+    def with_known(self, seen: Tensor, commands: Tensor | None = None, state: Tensor | None = None) -> Tensor:
+        """Output of φ `[*, d_Z]`, and behind it the remembered commands (`command_dims`) and the standardised state (of data
+        that have one) → latents `[*, D]`.
+
+        Args:
+            seen: output of φ.
+            commands: `[*, A]` leaky mean of the past actions in [-1, 1], `velap.data.commands`; None stands for zeros, as at
+                the start of an episode.
+            state: `[*, S]` as the data hold it; None stands for its mean.
         """
-        return self.with_commands(self.encoder(frames), commands)
-
-    def with_commands(self, seen: Tensor, commands: Tensor | None = None) -> Tensor:
-        """Output of φ `[*, d_Z]` and commands `[*, A]` → latents `[*, D]`."""
-        if self.config.command_dims == 0:
-            return seen
-        if commands is None:
-            commands = seen.new_zeros(*seen.shape[:-1], self.action_dim)
-        return torch.cat([seen, self.command_weight * commands[..., : self.config.command_dims]], -1)
+        known = []
+        if self.config.command_dims > 0:
+            if commands is None:
+                commands = seen.new_zeros(*seen.shape[:-1], self.action_dim)
+            known.append(self.command_weight * commands[..., : self.config.command_dims])
+        if self.spaces.state_dim > 0:
+            held = self.state_mean if state is None else state
+            known.append(((held - self.state_mean) * self.state_scale).expand(*seen.shape[:-1], -1))
+        return torch.cat([seen, *known], -1) if known else seen
 
     def step(self, latent: Tensor, action: Tensor) -> Tensor:
         """h: `[*, D], [*, A] → [*, D]`."""
@@ -184,7 +206,7 @@ class LatentModel(nn.Module):
 
     @property
     def seen_dim(self) -> int:
-        """Dimensions of the latent that φ gives; commands stand behind them."""
+        """Dimensions of the latent that φ gives; what is known stands behind them."""
         return self.encoder.width(self.config)
 
     @property

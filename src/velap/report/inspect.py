@@ -83,11 +83,12 @@ class Inspection:
 
 
 def inspect(source: str, *, image_key: str | None = None, image_size: int = IMAGE_SIZE, fit: Fit | None = None,
-            success: str | None = None, mapped: bool | None = None) -> Inspection:
+            success: str | None = None, mapped: bool | None = None,
+            state_key: str | None = None) -> Inspection:
     """Read and measure a dataset; arguments as for `load_store`. A dataset that cannot be read has that as its problem."""
     problems = []
     options: dict[str, Any] = {"image_key": image_key, "image_size": image_size, "fit": fit, "success": success,
-                               "mapped": mapped}
+                               "mapped": mapped, "state_key": state_key}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:

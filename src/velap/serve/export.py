@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,7 @@ class _Function:
     output: str
 
 
+STATE = "state float32 [*, S]"
 FRAMES, COMMANDS = "frames uint8 [*, N, H, W, 3]", "commands float32 [*, A] in [-1, 1]"
 LATENT, GOAL, ACTION = "latent float32 [*, D]", "goal float32 [*, D]", "action float32 [*, A] in [-1, 1]"
 FUNCTIONS = (
@@ -66,6 +67,13 @@ FUNCTIONS = (
     _Function("success_policy", "success_policy", (LATENT,), ACTION),
 )
 """φ, π^g, π^l, and the policies that not every config has."""
+
+
+def _functions(model: LatentModel) -> list[_Function]:
+    """Those of the model; the encoder of one with a state takes it too."""
+    found = [function for function in FUNCTIONS if getattr(model, function.module) is not None]
+    return [replace(each, inputs=(*each.inputs, STATE)) if each.name == "encode" and model.spaces.state_dim else each
+            for each in found]
 
 
 class _Alone(nn.Module):
@@ -96,8 +104,7 @@ def export(checkpoint: Path | str, out: Path | str, tolerance: float = TOLERANCE
         out.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:
-        programs = {function.name: _export(model, function, work, tolerance) for function in FUNCTIONS
-                    if getattr(model, function.module) is not None}
+        programs = {function.name: _export(model, function, work, tolerance) for function in _functions(model)}
         description = _describe(model, config, metadata, programs)
         write_atomic(work / DESCRIPTION, (json.dumps(description, indent=2) + "\n").encode())
         with storage_errors(out):
@@ -136,13 +143,16 @@ def _inputs(model: LatentModel, function: _Function, batch: int) -> tuple[Tensor
     shape = (batch, model.config.frame_stack, model.spaces.height, model.spaces.width, 3)
 
     def draw(kind: str) -> Tensor:
+        if kind == STATE:
+            noise = torch.randn(batch, model.spaces.state_dim, generator=generator)
+            return model.state_mean + noise / model.state_scale.clamp(min=1e-6)
         if kind == COMMANDS:
             return 2 * torch.rand(batch, model.action_dim, generator=generator) - 1
         frames = torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
         if kind == FRAMES:
             return frames
         with torch.no_grad():
-            return model.encode(frames, draw(COMMANDS))
+            return model.encode(frames, draw(COMMANDS), draw(STATE) if model.spaces.state_dim else None)
 
     return tuple(draw(kind) for kind in function.inputs)
 
@@ -155,7 +165,7 @@ def _describe(model: LatentModel, config: Config, metadata: Mapping[str, str],
         "format": EXPORT_FORMAT, "velap": __version__, "torch": torch.__version__, "task": config.task,
         "weights_sha256": metadata[WEIGHTS_SHA256], "frame_stack": config.model.frame_stack,
         "image_shape": [spaces.height, spaces.width, 3], "action_low": list(spaces.action_low),
-        "action_high": list(spaces.action_high), "command_memory": model.memory,
+        "action_high": list(spaces.action_high), "command_memory": model.memory, "state_size": model.spaces.state_dim,
         "reading": json.loads(metadata.get("reading", "null")),
         "programs": {name: asdict(program) for name, program in programs.items()},
     }

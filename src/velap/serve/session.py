@@ -62,7 +62,7 @@ def load_policy(checkpoint: Path | str, method: str = "velap", device: str = "au
         "server": f"velap {__version__}", "task": config.task, "method": method, "weights_sha256": metadata[WEIGHTS_SHA256],
         "image_shape": [spaces.height, spaces.width, 3], "frame_stack": config.model.frame_stack,
         "action_low": list(spaces.action_low), "action_high": list(spaces.action_high), "action_horizon": 1,
-        "reset_key": RESET, "seed_key": SEED,
+        "state_size": spaces.state_dim, "reset_key": RESET, "seed_key": SEED,
     }
 
     def agent() -> Agent:
@@ -79,6 +79,7 @@ class Session:
     def __init__(self, policy: Policy, image_key: str | None = None) -> None:
         self._agent = policy.make_agent()
         self._picture = PictureReader(policy.spaces, image_key, policy.reading)
+        self._state = StateFinder(policy.reading.state_key, policy.spaces.state_dim)
         self._frames: deque[NDArray[np.uint8]] = deque(maxlen=policy.frame_stack)
         self._stack = policy.frame_stack
 
@@ -90,14 +91,15 @@ class Session:
         """
         if not isinstance(observation, dict):
             raise ObservationError(f"got {type(observation).__name__}; expected a dict with the camera's picture.")
-        frame = self._picture(observation)
+        frame, state = self._picture(observation), self._state(observation)
         first, seed = _flag(observation.get(RESET, False)), _seed(observation.get(SEED, 0))
         if first or not self._frames:
             self._agent.reset(np.ones(1, bool), np.array([seed]))
             self._frames.clear()
         self._frames.append(frame)
         rows = stack_indices(np.array(len(self._frames) - 1), np.array(0), self._stack)
-        actions = self._agent.act(np.stack([self._frames[row] for row in rows])[None])
+        frames = np.stack([self._frames[row] for row in rows])[None]
+        actions = self._agent.act(frames) if state is None else self._agent.act(frames, state[None])
         planned = float(self._agent.last_plan_ms[0])
         return {"actions": actions, **({"plan_ms": planned} if np.isfinite(planned) else {})}
 
@@ -162,6 +164,31 @@ class PictureReader:
             raise ObservationError(f"the observation has {len(found)} pictures; expected one. It has {_listing(arrays)}. "
                                    "Send uint8[H, W, 3]; among several, name the one to use with --image-key.")
         return next(iter(found.items()))
+
+
+class StateFinder:
+    """The state [S] of an observation, for models that have one; everything else is an ObservationError.
+
+    Args:
+        state_key: its keys in the training data, `a,b`.
+        size: S; 0 for models without.
+    """
+
+    def __init__(self, state_key: str, size: int) -> None:
+        self._keys, self._size = keys_of(state_key), size
+
+    def __call__(self, observation: Mapping[str, Any]) -> NDArray[np.float32] | None:
+        if not self._size:
+            return None
+        arrays = {name: array for name, array in _arrays(observation) if array.dtype.kind in "fiub" and array.ndim <= 1}
+        keys = self._keys if self._keys and arrays.keys() >= set(self._keys) else [
+            name for name, array in arrays.items() if array.size == self._size]
+        found = [arrays[key].reshape(-1) for key in keys]
+        if not found or sum(part.size for part in found) != self._size or not all(np.isfinite(part).all() for part in found):
+            raise ObservationError(f"the observation has no state of {self._size} finite numbers; it has "
+                                   f"{_listing(dict(_arrays(observation)))}. Send it under "
+                                   f"{', '.join(self._keys) or 'any key'}, as in the training data.")
+        return np.concatenate(found).astype(np.float32)
 
 
 def _arrays(values: Mapping[str, Any], prefix: str = "", depth: int = 0) -> Iterator[tuple[str, np.ndarray]]:

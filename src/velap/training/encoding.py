@@ -26,14 +26,16 @@ def evaluated(*modules: nn.Module) -> Iterator[None]:
             module.train()
 
 
-def commands_before(model: LatentModel, sampler: WindowSampler, rows: Tensor) -> Tensor | None:
-    """What the model remembers of the actions before rows: int64 [M] -> [M, A]; None for a model without commands."""
-    return sampler.commands(rows, model.memory) if model.memory > 0 else None
+def known_at(model: LatentModel, sampler: WindowSampler, rows: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """What is known at rows int64 [M] beside the frames: the remembered commands [M, A] and the state [M, S]; None for a
+    model or data without."""
+    return (sampler.commands(rows, model.memory) if model.memory > 0 else None,
+            None if sampler.states is None else sampler.states[rows])
 
 
 def encode_rows(model: LatentModel, sampler: WindowSampler, rows: Tensor, chunk: int = 1024) -> Tensor:
     """Latents of rows of the dataset: int64 [M] -> [M, D]."""
-    return in_parts(lambda part: model.encode(sampler.stacks(part), commands_before(model, sampler, part)), rows, chunk)
+    return in_parts(lambda part: model.encode(sampler.stacks(part), *known_at(model, sampler, part)), rows, chunk)
 
 
 @torch.no_grad()
@@ -44,4 +46,4 @@ def encode_all(model: LatentModel, sampler: WindowSampler, features: Tensor | No
     with evaluated(model):
         measured = model.encoder.measure(sampler.frames) if features is None else features
         seen = in_parts(lambda part: model.encoder.encode(measured[sampler.stack_rows(part)]), rows, model.encoder.chunk)
-        return model.with_commands(seen, commands_before(model, sampler, rows))
+        return model.with_known(seen, *known_at(model, sampler, rows))

@@ -18,7 +18,7 @@ from velap.losses import Info, infonce_loss, model_loss, rollout_mse_loss
 from velap.models.velap import LatentModel
 from velap.training.capture import adam
 from velap.training.encoder import FrameDecoder
-from velap.training.encoding import commands_before
+from velap.training.encoding import known_at
 from velap.training.phase import PhaseLearner, Run, few_threads
 
 LEARNING_RATE = 3e-4
@@ -77,7 +77,7 @@ class JointLearner(PhaseLearner[JointPhase]):
         # φ. The heads' gradient is gathered in `seen` and goes to the encoder in one piece.
         encoded = model.encoder.encode(run.features[run.sampler.stack_rows(batch.rows)])
         seen = encoded.detach().requires_grad_()
-        latents = model.with_commands(seen, commands_before(model, run.sampler, batch.rows))
+        latents = model.with_known(seen, *known_at(model, run.sampler, batch.rows))
         with few_threads(batch):
             dynamics, info = self.dynamics_loss(latents, batch)  # L_h, Eq. 9
             local, task, more = run.actor_critic.critic_losses(latents, batch)  # Eq. 3 and 4
@@ -104,5 +104,5 @@ class JointLearner(PhaseLearner[JointPhase]):
         if self.phase.dynamics_loss == "mse":
             return rollout_mse_loss(predicted, latents[truth], valid, torch.ones((), device=latents.device))
         candidates = latents[: batch.valid.shape[0] * (batch.valid.shape[1] + 1)]
-        known = self.run.model.seen_dim  # commands would tell the candidates apart in place of φ
+        known = self.run.model.seen_dim  # what is known beside the frames would tell the candidates apart in place of φ
         return infonce_loss(predicted[..., :known], truth, candidates[:, :known], valid)

@@ -83,6 +83,16 @@ def success_share(store: FrameStore) -> float:
     return float((np.bincount(store.episode_of, weights=store.rewards) > 0).mean())
 
 
+def standardisation(states: np.ndarray | None) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Mean and one by the deviation of states float32 [F, S], 0 for entries that never vary; both empty without states."""
+    if states is None:
+        return (), ()
+    mean, deviation = states.mean(0, dtype=np.float64), states.std(0, dtype=np.float64)
+    varies = deviation > 1e-6 * np.maximum(1, np.abs(mean))
+    scale = np.divide(1, deviation, out=np.zeros_like(deviation), where=varies)
+    return tuple(map(float, mean)), tuple(map(float, scale))
+
+
 class Trainer:
     """One run: steps through the phases, saves and resumes."""
 
@@ -93,7 +103,8 @@ class Trainer:
         self.sampler = WindowSampler(store, config.train, config.model.frame_stack, device, self.holdout)
         self._check_data()
         height, width = store.frames.shape[1:3]
-        spaces = Spaces(height, width, tuple(map(float, store.action_low)), tuple(map(float, store.action_high)))
+        spaces = Spaces(height, width, tuple(map(float, store.action_low)), tuple(map(float, store.action_high)),
+                        *standardisation(store.states))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.model = make_model(config, spaces).to(device).train()

@@ -22,6 +22,7 @@ from PIL import Image
 from velap.data.frames import Episode
 from velap.data.images import ImageLayout
 from velap.data.loading import files_state
+from velap.data.state import StateLayout
 from velap.errors import DatasetError
 from velap.registry import register_reader
 
@@ -64,7 +65,9 @@ class LeRobotReader:
             raise DatasetError(f"{source} has the features {', '.join(self._features)}; expected `action` among them.")
         kinds = {key: feature["dtype"] for key, feature in self._features.items()}
         cameras = {key: self._camera(key) for key, kind in kinds.items() if kind in ("image", "video")}
-        self.observation_space = gym.spaces.Dict(cameras)
+        numbers = {key: gym.spaces.Box(-np.inf, np.inf, tuple(self._features[key]["shape"]), np.float32)
+                   for key, kind in kinds.items() if key.startswith("observation.") and kind.startswith(("float", "int"))}
+        self.observation_space = gym.spaces.Dict(cameras | numbers)
         self.action_space = gym.spaces.Box(-np.inf, np.inf, tuple(self._features["action"]["shape"]), np.float32)
         self.frames = int(self._info.get("total_frames", 0))
 
@@ -85,7 +88,7 @@ class LeRobotReader:
             shape = (*shape[1:], shape[0])
         return gym.spaces.Box(0, 255, shape, np.uint8)
 
-    def episodes(self, layout: ImageLayout) -> Iterator[Episode]:
+    def episodes(self, layout: ImageLayout, state: StateLayout | None = None) -> Iterator[Episode]:
         """All episodes in order of their index."""
         pa, pq = _pyarrow()
         key, video = layout.name, self._features[layout.name]["dtype"] == "video"
@@ -121,8 +124,9 @@ class LeRobotReader:
                 raise DatasetError(f"{self.name}, episode {index} has {len(rows)} rows and {len(images)} images; expected "
                                    f"{length} each. Download the dataset again.")
             actions = values.pop("action")
+            held = None if state is None else state.joined(values[name] for name in state.names)
             values |= {name.removeprefix(NEXT): column for name, column in values.items()}
-            yield Episode.of_rows(images, actions, values.pop("reward", None), values)
+            yield Episode.of_rows(images, actions, values.pop("reward", None), values, held)
 
     def _video_path(self, key: str, entry: dict[str, Any]) -> Path:
         return self._root / self._info["video_path"].format(video_key=key, chunk_index=entry[f"videos/{key}/chunk_index"],

@@ -11,6 +11,7 @@ from velap.data import minari_io
 from velap.data.frames import Episode
 from velap.data.images import ImageLayout
 from velap.data.loading import files_state
+from velap.data.state import StateLayout
 from velap.registry import register_reader
 
 
@@ -50,8 +51,9 @@ class MinariReader:
         data = minari_io.dataset_path(self.name) / "data"
         return str(self._checksums.get("file_sha256") or files_state([path for path in data.rglob("*") if path.is_file()]))
 
-    def episodes(self, layout: ImageLayout) -> Iterator[Episode]:
+    def episodes(self, layout: ImageLayout, state: StateLayout | None = None) -> Iterator[Episode]:
         """All episodes in order."""
         for raw in minari_io.raw_episodes(self._dataset):
             yield Episode(layout.of(raw["observations"]), raw["actions"], raw["rewards"], raw["terminations"],
-                          raw["truncations"], flat_infos(raw["infos"]))
+                          raw["truncations"], flat_infos(raw["infos"]),
+                          None if state is None else state.of_episode(raw["observations"]))

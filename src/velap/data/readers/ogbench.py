@@ -21,6 +21,7 @@ from velap.data.building import image_space
 from velap.data.frames import Episode
 from velap.data.images import ImageLayout
 from velap.data.loading import files_state
+from velap.data.state import StateLayout
 from velap.errors import DatasetError
 from velap.registry import register_reader
 
@@ -66,7 +67,7 @@ class OGBenchReader:
         """Size and time of the file."""
         return files_state([self._path])
 
-    def episodes(self, layout: ImageLayout) -> Iterator[Episode]:
+    def episodes(self, layout: ImageLayout, state: StateLayout | None = None) -> Iterator[Episode]:
         """All trajectories in order."""
         ends = np.flatnonzero(self._terminals).tolist()
         if not self._terminals[-1]:

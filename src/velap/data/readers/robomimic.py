@@ -18,6 +18,7 @@ from velap.data.building import image_space
 from velap.data.frames import Episode
 from velap.data.images import ImageLayout
 from velap.data.loading import files_state
+from velap.data.state import StateLayout
 from velap.errors import DatasetError
 from velap.registry import register_reader
 
@@ -66,24 +67,27 @@ class RobomimicReader:
         """Size and time of the file."""
         return files_state([self._path])
 
-    def episodes(self, layout: ImageLayout) -> Iterator[Episode]:
+    def episodes(self, layout: ImageLayout, state: StateLayout | None = None) -> Iterator[Episode]:
         """All demonstrations, by number."""
         with h5py.File(self._path, "r") as file:
             for name in self._demos:
                 demo = file["data"][name]
                 try:
-                    yield self._episode(demo, layout)
+                    yield self._episode(demo, layout, state)
                 except (OSError, KeyError, ValueError) as error:
                     raise DatasetError(f"{self.name}, {name} cannot be read ({type(error).__name__}: {error}); expected the "
                                        "layout of robomimic. Write or download the file again.") from error
 
-    def _episode(self, demo: Any, layout: ImageLayout) -> Episode:
+    def _episode(self, demo: Any, layout: ImageLayout, state: StateLayout | None) -> Episode:
+        numbers = None if state is None else state.joined(demo["obs/" + name][:] for name in state.names)
         images, actions = demo["obs/" + layout.name][:], demo["actions"][:]
         rewards = demo["rewards"][:] if "rewards" in demo else None
         infos = {key: demo[key][:] for key in demo if isinstance(demo[key], h5py.Dataset) and demo[key].ndim <= 2
                  and key not in ("actions", "rewards", "states") and len(demo[key]) == len(actions)}
         following = demo.get("next_obs/" + layout.name)
         if following is None:
-            return Episode.of_rows(images, actions, rewards, infos)
+            return Episode.of_rows(images, actions, rewards, infos, numbers)
         images = np.concatenate([images, following[-1:]])
-        return Episode(images, actions, rewards, infos=infos)
+        if state is not None and numbers is not None:
+            numbers = np.concatenate([numbers, state.joined(demo["next_obs/" + name][-1:] for name in state.names)])
+        return Episode(images, actions, rewards, infos=infos, state=numbers)

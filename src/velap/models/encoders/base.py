@@ -104,6 +104,7 @@ def encoder_class(config: ModelConfig) -> type[Encoder]:
     return cast(type[Encoder], ENCODERS[config.encoder])
 
 
-def latent_width(config: ModelConfig, actions: int) -> int:
-    """D with all that is in a latent: φ's output, and the remembered commands of `actions` action dimensions."""
-    return encoder_class(config).width(config) + min(config.command_dims, actions)
+def latent_width(config: ModelConfig, actions: int, state: int = 0) -> int:
+    """D with all that is in a latent: φ's output, the remembered commands of `actions` action dimensions, and `state`
+    entries of the state."""
+    return encoder_class(config).width(config) + min(config.command_dims, actions) + state

@@ -85,6 +85,7 @@ def load_as_trained(dataset_id: str, image_key: str | None, model: LatentModel, 
     """A dataset, read as the training data of the checkpoint with `metadata`, except for a camera or rule that is given."""
     reading = Reading.from_json(metadata["reading"]) if "reading" in metadata else Reading()
     return load_store(dataset_id, image_key or reading.image_key or None, image_size=model.spaces.height, fit=reading.fit,
+                      state_key=reading.state_key or None,
                       success=success or reading.success or None)
 
 
