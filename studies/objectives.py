@@ -25,7 +25,7 @@ from velap.models.velap import LatentModel
 from velap.registry import register_encoder
 from velap.training.capture import adam
 from velap.training.encoder import INVERSE
-from velap.training.encoding import commands_before
+from velap.training.encoding import known_at
 from velap.training.joint import LEARNING_RATE, RECONSTRUCTION, JointLearner, rollouts
 from velap.training.latent import LATENT_BATCH, LatentLearner
 from velap.training.loop import ON_FRAMES, ON_LATENTS
@@ -82,7 +82,7 @@ def dynamics_loss(model: LatentModel, latents: Tensor, batch: Batch, kind: str, 
     if kind == "mse":
         return rollout_mse_loss(predicted, latents[truth], valid, square)
     windows, length = batch.valid.shape
-    known = model.seen_dim  # commands would tell the candidates apart in place of φ
+    known = model.seen_dim  # what is known beside the frames would tell the candidates apart in place of φ
     return infonce_loss(predicted[..., :known], truth, latents[: windows * (length + 1), :known], valid)
 
 
@@ -109,7 +109,7 @@ class ObjectiveLearner(JointLearner):
         for optimizer in steps:
             optimizer.zero_grad(set_to_none=True)
         seen = model.encoder.encode(run.features[run.sampler.stack_rows(batch.rows)])
-        latents = model.with_commands(seen, commands_before(model, run.sampler, batch.rows))
+        latents = model.with_known(seen, *known_at(model, run.sampler, batch.rows))
         fixed = latents.detach()
         with few_threads(batch):
             dynamics, info = dynamics_loss(model, latents if "dynamics" in self.shaped_by else fixed, batch,

@@ -153,10 +153,10 @@ def test_train_has_every_option_of_python(monkeypatch: pytest.MonkeyPatch) -> No
     typed = ["--dataset", "robot/pile-v0", "--image-key", "front", "--image-key", "wrist", "--preset", "paper",
              "--seed", "7", "--out", "elsewhere",
              "--device", "cpu", "--resume", "--set", "train.c0=2", "--method", "td3bc", "--success", "terminated",
-             "--fit", "pad", "--image-size", "96", "--mapped"]
+             "--fit", "pad", "--image-size", "96", "--mapped", "--state-key", "joints"]
     given = {"source": "robot/pile-v0", "image_key": "front,wrist", "preset": "paper", "seed": 7, "out": Path("elsewhere"),
              "device": "cpu", "resume": True, "changes": {"train": {"c0": 2}}, "method": "td3bc", "success": "terminated",
-             "fit": "pad", "image_size": 96, "mapped": True}
+             "fit": "pad", "image_size": 96, "mapped": True, "state_key": "joints"}
     for loggers in ((), ("jsonl",), ("tensorboard", "wandb")):
         assert cli.main(["train", *typed, "--loggers", *loggers]) == 0
         own = {"command": seen.pop("command"), "on_progress": seen.pop("on_progress")}
