@@ -88,7 +88,8 @@ def test_every_method_sees_its_own_past_actions(method):
         if hasattr(head, "steps_ahead"):
             head.steps_ahead.fill_(2)
     space = gym.spaces.Box(-2.0, 2.0, (3,))
-    agent = make_agent(method, model, config(model.config), space, head)
+    quick = {"samples": 24, "horizon": 6, "elites": 4} if method in ("mppi", "mbop") else {}
+    agent = make_agent(method, model, config(model.config), space, head, settings=kind.settings_of("default", quick))
     agent.reset(np.ones(2, bool))
     frames = np.zeros((2, 2, 16, 16, 3), np.uint8)
     first = agent.act(frames)
