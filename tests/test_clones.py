@@ -96,7 +96,6 @@ def test_every_candidate_begins_anew_and_the_best_one_ends_in_the_model(tmp_path
 
 @pytest.mark.parametrize("done", [1, 5, 7])
 def test_a_resume_between_and_within_candidates_goes_on_to_the_same_bits(tmp_path, monkeypatch, done: int) -> None:
-    monkeypatch.setattr("velap.training.clone.STATES", 60)
     monkeypatch.setattr("velap.training.clone.HORIZON", 12)
     straight_and_resumed(tmp_path, cloning(), 12 + done)
 
