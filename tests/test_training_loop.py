@@ -52,7 +52,7 @@ def test_train_writes_a_loadable_model_and_readable_metrics(tmp_path):
     assert [row["step"] for row in rows] == [2, 4, 6, 8, 10, 12]
     assert "rollout/error_3" in rows[-1] and [row["phase"] for row in rows] == ["joint"] * 3 + ["latent"] * 3
     assert [p.step for p in seen] == [2, 4, 6, 8, 10, 12]
-    assert json.loads((tmp_path / "config.json").read_text())["schema"] == 3
+    assert json.loads((tmp_path / "config.json").read_text())["schema"] == 4
     assert any((tmp_path / "tensorboard").iterdir())
 
 
