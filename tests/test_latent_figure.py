@@ -126,6 +126,6 @@ def test_landmarks_lie_apart() -> None:
     assert set(spread(places, 4)) >= {2, 3, 4} and len(spread(places, 9)) == 5
 
 
-def test_only_figure_3_takes_a_task(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_figure_without_tasks_refuses_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["figure", "tasks", "SpiralMaze"]) == 2
-    assert "only figure 3 takes one" in capsys.readouterr().err
+    assert "only figures 3, 5 and 6 take one" in capsys.readouterr().err
