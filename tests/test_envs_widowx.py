@@ -153,7 +153,7 @@ def test_a_core_makes_many_steps_a_second_with_pixels(kind):
         for _ in range(50):
             task.step(rng.uniform(-1, 1, 4).astype(np.float32))
         rounds.append((time.process_time() - began) / 50)
-    assert min(rounds[1:]) < 0.0125, "4 ms on a recent core, 6.3 ms on one without AVX-512"
+    assert min(rounds[1:]) < 0.0125, "below 5 ms on a recent core, 6.3 ms on one without AVX-512"
 
 
 @pytest.mark.parametrize("seed", range(1000, 1005))
